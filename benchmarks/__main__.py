@@ -35,14 +35,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise SystemExit(2)
     if benchmark is None:
         raise SystemExit(run_all(chosen))
-    options = {name: value for name, value in vars(chosen).items() if name not in SHARED and value is not None}
+    options = {
+        name: value
+        for name, value in vars(chosen).items()
+        if name not in SHARED and value is not None
+    }
     import_module(benchmark.module_name).run(Output(chosen.output, chosen.quick), **options)
 
 
 def run_all(chosen: argparse.Namespace) -> int:
     """Run every benchmark in a process of its own; 1 if one of them fails.
 
-    What is done is noted beside the results with the commit, so that a second call goes on where the first one ended.
+    What is done is noted beside the results with the commit, so that a second call goes on where
+    the first one ended.
     """
     from benchmarks.output import hardware
 
@@ -51,7 +56,11 @@ def run_all(chosen: argparse.Namespace) -> int:
     output.mkdir(parents=True, exist_ok=True)
     ledger = output / ".all"
     done = set(ledger.read_text().splitlines()) if ledger.exists() else set()
-    flags = [f"--{name.replace('_', '-')}" for name in ("quick", "allow_uncommitted") if getattr(chosen, name)]
+    flags = [
+        f"--{name.replace('_', '-')}"
+        for name in ("quick", "allow_uncommitted")
+        if getattr(chosen, name)
+    ]
     failed = 0
     for benchmark in BENCHMARKS:
         note = f"{state} {benchmark.name}"
@@ -59,9 +68,20 @@ def run_all(chosen: argparse.Namespace) -> int:
             continue
         print(f"{benchmark.name}: {benchmark.question}", flush=True)
         start = time.perf_counter()
-        command = [sys.executable, "-m", "benchmarks", benchmark.name, "--output", str(output), *flags]
+        command = [
+            sys.executable,
+            "-m",
+            "benchmarks",
+            benchmark.name,
+            "--output",
+            str(output),
+            *flags,
+        ]
         code = subprocess.run(command, cwd=ROOT).returncode
-        print(f"{benchmark.name}: status {code}, {(time.perf_counter() - start) / 60:.1f} minutes", flush=True)
+        print(
+            f"{benchmark.name}: status {code}, {(time.perf_counter() - start) / 60:.1f} minutes",
+            flush=True,
+        )
         failed |= code != 0
         if not (code or state.endswith("-dirty")):
             with ledger.open("a") as file:
@@ -73,26 +93,40 @@ def listing(benchmark: Benchmark) -> str:
     """Name, minutes, question and results of a benchmark, as lines of text."""
     full, quick = (f"{minutes:g}" for minutes in benchmark.minutes)
     results = ", ".join(benchmark.files) or "keeps no result"
-    return f"{benchmark.name}  {full} min, quick {quick} min\n    {benchmark.question}\n    {results}"
+    return (
+        f"{benchmark.name}  {full} min, quick {quick} min\n    {benchmark.question}\n    {results}"
+    )
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line: the shared options, and those of each benchmark."""
-    main_parser = argparse.ArgumentParser("python -m benchmarks", description="Without a name, lists all benchmarks.")
+    main_parser = argparse.ArgumentParser(
+        "python -m benchmarks", description="Without a name, lists all benchmarks."
+    )
     names = main_parser.add_subparsers(dest="name", metavar="NAME", title="benchmarks")
     shared = argparse.ArgumentParser(add_help=False)
-    shared.add_argument("--quick", action="store_true", help="small and inaccurate, into files named _quick")
-    default = ROOT / "benchmarks" / "results"
-    shared.add_argument("--output", type=Path, default=default, help="folder [default: benchmarks/results]")
     shared.add_argument(
-        "--allow-uncommitted", action="store_true", help="write results although the tree has uncommitted changes"
+        "--quick", action="store_true", help="small and inaccurate, into files named _quick"
+    )
+    default = ROOT / "benchmarks" / "results"
+    shared.add_argument(
+        "--output", type=Path, default=default, help="folder [default: benchmarks/results]"
+    )
+    shared.add_argument(
+        "--allow-uncommitted",
+        action="store_true",
+        help="write results although the tree has uncommitted changes",
     )
     about = "run all of them, one after the other; a second call goes on where the first one ended"
     names.add_parser("all", parents=[shared], help=about, description=about)
     about = "draw the figures of the committed results again, without a measurement"
     draw = names.add_parser("draw", help=about, description=about)
-    draw.add_argument("pictures", nargs="*", metavar="PICTURE", help="name without .png [default: all]")
-    draw.add_argument("--output", type=Path, default=default, help="folder [default: benchmarks/results]")
+    draw.add_argument(
+        "pictures", nargs="*", metavar="PICTURE", help="name without .png [default: all]"
+    )
+    draw.add_argument(
+        "--output", type=Path, default=default, help="folder [default: benchmarks/results]"
+    )
     for benchmark in BENCHMARKS:
         one = names.add_parser(
             benchmark.name,
@@ -106,7 +140,9 @@ def parser() -> argparse.ArgumentParser:
                 one.add_argument(option.name, action="store_true", help=option.help)
             else:
                 place = {} if option.name.startswith("-") else {"nargs": "?"}
-                one.add_argument(option.name, type=option.kind, choices=option.choices, help=option.help, **place)
+                one.add_argument(
+                    option.name, type=option.kind, choices=option.choices, help=option.help, **place
+                )
     return main_parser
 
 

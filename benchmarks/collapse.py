@@ -1,23 +1,27 @@
 """What a time step does to an inelastic collapse: three and four equal discs in a row.
 
-Alternate collisions of neighbours follow a linear law. Let x_k be the speed of approach of collision k. Then
+Alternate collisions of neighbours follow a linear law. Let x_k be the speed of approach of
+collision k. Then
 
-    x_{k+2} = c (1 + r)/2 x_{k+1} − r x_k,    c = 1 for three discs, and √2 for four that move symmetrically,
+    x_{k+2} = c (1 + r)/2 x_{k+1} − r x_k,    c = 1 for three discs, and √2 for four that move
+    symmetrically,
 
-because a collision passes the share (1 + r)/2 of its approach to the neighbours and turns the rest around. (Four discs
-in symmetric motion are two discs and a wall. x of the middle pair is divided by √2 here.) The roots λ± of
-λ² − c (1 + r)/2 λ + r = 0 are real below r_c = tan²(π/12) = 7 − 4√3 = 0.0718 for three discs (Zhou and Kadanoff, Phys.
-Rev. E 54, 623, 1996), and below r_c = tan²(π/8) = 3 − 2√2 = 0.1716 for these four (Bernu and Mazighi, J. Phys. A 23,
-5745, 1990, for discs and a wall). What follows:
+because a collision passes the share (1 + r)/2 of its approach to the neighbours and turns the rest
+around. (Four discs in symmetric motion are two discs and a wall. x of the middle pair is divided by
+√2 here.) The roots λ± of λ² − c (1 + r)/2 λ + r = 0 are real below r_c = tan²(π/12) = 7 − 4√3 =
+0.0718 for three discs (Zhou and Kadanoff, Phys. Rev. E 54, 623, 1996), and below r_c = tan²(π/8) =
+3 − 2√2 = 0.1716 for these four (Bernu and Mazighi, J. Phys. A 23, 5745, 1990, for discs and a
+wall). What follows:
 
 - Above r_c there are at most ⌈π/θ⌉ collisions, cos θ = c (1 + r)/(4√r), whatever the start.
-- Below r_c some starts collapse. The time between collisions falls by λ₋/λ₊ and the speed by λ₊ at each. A time step
-  ends the collapse with one collision of all, where that time is as short. So the steps with contacts grow by
-  1/log₁₀(λ₊/λ₋) for each decade of dt, and the excess of the force ratio falls as dt^β, β = ln(1/λ₊)/ln(λ₊/λ₋).
+- Below r_c some starts collapse. The time between collisions falls by λ₋/λ₊ and the speed by λ₊ at
+  each. A time step ends the collapse with one collision of all, where that time is as short. So the
+  steps with contacts grow by 1/log₁₀(λ₊/λ₋) for each decade of dt, and the excess of the force
+  ratio falls as dt^β, β = ln(1/λ₊)/ln(λ₊/λ₋).
 
-Three discs collapse below r_c if, and only if, the third disc leaves the second more slowly than λ₊ times the first
-approach. The starts here do: the outer discs come in at equal speeds. Four discs keep their symmetry. Counts are
-averaged over many first gaps, as each alone is a staircase.
+Three discs collapse below r_c if, and only if, the third disc leaves the second more slowly than λ₊
+times the first approach. The starts here do: the outer discs come in at equal speeds. Four discs
+keep their symmetry. Counts are averaged over many first gaps, as each alone is a staircase.
 
     python -m benchmarks collapse           # a minute
     python -m benchmarks collapse --quick   # fewer gaps, under half a minute
@@ -42,7 +46,11 @@ EXACT = jg.BarzilaiBorwein(tolerance=1e-12, max_steps=100_000)
 GRAINS, SIDE = 32, 20.0  # the discs that are not in the row rest elsewhere
 TIMESTEPS = 10.0 ** -np.arange(2, 8.25, 0.5)  # σ over the first speed
 COARSE, FINE = 1e-4, 3e-8  # time steps between which the laws of vanishing dt are measured
-LAWS = ("most_steps", "steps_per_decade", "exponent")  # what is measured above, and below the threshold
+LAWS = (
+    "most_steps",
+    "steps_per_decade",
+    "exponent",
+)  # what is measured above, and below the threshold
 TITLES = {
     3: r"three discs, $r_\mathrm{c} = 7-4\sqrt{3} = 0.0718$",
     4: r"four discs, symmetric, $r_\mathrm{c} = 3-2\sqrt{2} = 0.1716$",
@@ -54,7 +62,9 @@ advance = jax.jit(jg.advance)
 
 
 class Roots(NamedTuple):
-    """λ₊ and λ₋ of a collapse, the steps with contacts that a decade of dt adds, and the exponent β of the excess."""
+    """λ₊ and λ₋ of a collapse, the steps with contacts that a decade of dt adds, and the exponent β
+    of the excess.
+    """
 
     larger: float
     smaller: float
@@ -81,12 +91,16 @@ def roots(discs: int, restitution: float) -> Roots:
 
 
 def most_collisions(discs: int, restitution: float) -> int:
-    """Alternate collisions that any start can have, above the threshold; for four discs both outer ones count once."""
+    """Alternate collisions that any start can have, above the threshold; for four discs both outer
+    ones count once.
+    """
     return int(np.ceil(np.pi / np.arccos(half_trace(discs, restitution) / np.sqrt(restitution))))
 
 
 def row(discs: int, gap: float) -> jg.State:
-    """Three or four discs in a row, the middle gap or the second one given; the outer discs come in at speed one."""
+    """Three or four discs in a row, the middle gap or the second one given; the outer discs come in
+    at speed one.
+    """
     gaps, velocities = {3: ((GAP, gap), (1, 0, -1)), 4: ((GAP, gap, GAP), (1, 0, 0, -1))}[discs]
     others = np.arange(GRAINS - discs)
     rest = np.stack([2.0 + 2 * (others % 8), 10 + 2 * (others // 8)], axis=-1)
@@ -116,13 +130,19 @@ def steps_and_excess(
 
 
 def run(output: Output) -> None:
-    """Measure all rows, print slopes and exponents beside the exact ones, and write JSON and PNG."""
+    """Measure all rows, print slopes and exponents beside the exact ones, and write JSON and
+    PNG.
+    """
     gaps = GAP * np.geomspace(0.5, 2, 16 if output.quick else 128)
     rows = [study(discs, r, gaps) for discs, several in RESTITUTIONS.items() for r in several]
-    print("discs      r   steps with contacts, at most   steps that a decade adds   exponent of the excess")
+    print(
+        "discs      r   steps with contacts, at most   steps that a decade adds   exponent of the "
+        "excess"
+    )
     for one in rows:
         print(
-            f"{one['discs']:5d}{one['restitution']:7g}   " + "   ".join(table_cell(law, one.get(law)) for law in LAWS)
+            f"{one['discs']:5d}{one['restitution']:7g}   "
+            + "   ".join(table_cell(law, one.get(law)) for law in LAWS)
         )
     choices = {
         "first_gap": GAP,
@@ -137,7 +157,9 @@ def run(output: Output) -> None:
 
 
 def table_cell(law: str, values: tuple | None) -> str:
-    """A measured number with its error beside the exact one, as text of fixed width; empty where it does not apply."""
+    """A measured number with its error beside the exact one, as text of fixed width; empty where it
+    does not apply.
+    """
     if values is None:
         return " " * 26
     if law == "most_steps":
@@ -148,7 +170,9 @@ def table_cell(law: str, values: tuple | None) -> str:
 def study(discs: int, restitution: float, gaps: np.ndarray) -> dict:
     """Means over the starts at each time step, and the law of vanishing dt, measured and exact."""
     states = [row(discs, gap) for gap in gaps]
-    steps, excess = np.stack([steps_and_excess(restitution, dt, states) for dt in TIMESTEPS], axis=1)
+    steps, excess = np.stack(
+        [steps_and_excess(restitution, dt, states) for dt in TIMESTEPS], axis=1
+    )
     found = {"discs": discs, "restitution": restitution}
     for name, values in (("steps", steps), ("excess", excess)):
         found[name] = list(values.mean(axis=1))
@@ -156,7 +180,9 @@ def study(discs: int, restitution: float, gaps: np.ndarray) -> dict:
     if restitution > THRESHOLDS[discs]:
         return found | {"most_steps": (float(steps.max()), most_collisions(discs, restitution))}
     exact = roots(discs, restitution)
-    for name, values in zip(("steps_per_decade", "exponent"), slopes(exact, restitution, states), strict=True):
+    for name, values in zip(
+        ("steps_per_decade", "exponent"), slopes(exact, restitution, states), strict=True
+    ):
         error = values.std(ddof=1) / np.sqrt(len(gaps))
         found[name] = (float(values.mean()), float(error), float(getattr(exact, name)))
     return found
@@ -167,17 +193,22 @@ def slopes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Steps that a decade of dt adds, and exponent of the excess, of each start.
 
-    The two time steps are a whole number of collisions apart, λ₋/λ₊ each, so that the staircases are at equal heights.
+    The two time steps are a whole number of collisions apart, λ₋/λ₊ each, so that the staircases
+    are at equal heights.
     """
     collisions = int(np.log(COARSE / FINE) / np.log(exact.larger / exact.smaller))
     decades = collisions * np.log10(exact.larger / exact.smaller)
-    coarse, fine = (steps_and_excess(restitution, dt, states, advance) for dt in (COARSE, COARSE / 10**decades))
+    coarse, fine = (
+        steps_and_excess(restitution, dt, states, advance) for dt in (COARSE, COARSE / 10**decades)
+    )
     return (fine[0] - coarse[0]) / decades, np.log10(coarse[1] / fine[1]) / decades
 
 
 @styled
 def draw(rows: list[dict]) -> Figure:
-    """Steps and excess against dt, a column for each number of discs; lines of the exact slopes below the threshold."""
+    """Steps and excess against dt, a column for each number of discs; lines of the exact slopes
+    below the threshold.
+    """
     figure = Figure(figsize=(TWO_COLUMNS, 4.6), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, sharey="row")
     for column, discs in enumerate(RESTITUTIONS):

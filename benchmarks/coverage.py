@@ -1,14 +1,16 @@
 """How often 95 % intervals cover the true mean, by repeats of sheared flows.
 
-The errors are those of ``standard_errors``, and an interval is 1.96 errors to each side. Its width is given over that
-of the true interval, 1.96 standard deviations of the mean.
+The errors are those of ``standard_errors``, and an interval is 1.96 errors to each side. Its width
+is given over that of the true interval, 1.96 standard deviations of the mean.
 
-Each flow is repeated with independent grains. A repeat is prepared over five correlation strains and sampled over
-eight; its first two, four and six are judged too, all in 32 blocks. The correlation strain is max(nT/τ, 0.35 L √(ρ/p)).
-The repeats are divided at random into groups of seeds. The truth is the value from all R repeats. It shares the k seeds
-of a group, so a deviation from it is divided by √(1 - k/R).
+Each flow is repeated with independent grains. A repeat is prepared over five correlation strains
+and sampled over eight; its first two, four and six are judged too, all in 32 blocks. The
+correlation strain is max(nT/τ, 0.35 L √(ρ/p)). The repeats are divided at random into groups of
+seeds. The truth is the value from all R repeats. It shares the k seeds of a group, so a deviation
+from it is divided by √(1 - k/R).
 
-With an error, nine points are sampled until it is reached, 40 times by four seeds each, and the same is asked of these
+With an error, nine points are sampled until it is reached, 40 times by four seeds each, and the
+same is asked of these
 intervals: a sample that ends when its estimated error is small may be one that underestimates it.
 
     python -m benchmarks coverage           # about 6 minutes on a core
@@ -66,24 +68,40 @@ def run(output: Output, error: float | None = None) -> None:
     if error is not None:
         judge_error(output, error)
         return
-    plan, rng, start = QUICK if output.quick else FULL, np.random.default_rng(0), time.perf_counter()
+    plan, rng, start = (
+        QUICK if output.quick else FULL,
+        np.random.default_rng(0),
+        time.perf_counter(),
+    )
     rows = []
     for flow in plan.flows:
         rows += flow_rows(plan, *flow, rng)
         print(f"α {flow[0]:g}, ν {flow[1]:g}: {time.perf_counter() - start:.0f} s", flush=True)
     over_flows = [*means_over_flows(rows)]
-    print(f"mean over {len(plan.flows)} flows of the share of intervals that cover [smallest of a flow] / mean width")
+    print(
+        f"mean over {len(plan.flows)} flows of the share of intervals that cover [smallest of a "
+        "flow] / mean width"
+    )
     for row in over_flows:
         shares = f"{row['covered']:.2f} [{row['least_covered']:.2f}] / {row['width']:.2f}"
-        print(f"{row['observable']:21s} strain/correlation strain {row['strain']}, seeds {row['seeds']}: {shares}")
-    head = {"plan": plan._asdict(), "seconds": time.perf_counter() - start, "over_flows": over_flows}
+        print(
+            f"{row['observable']:21s} strain/correlation strain {row['strain']}, seeds "
+            f"{row['seeds']}: {shares}"
+        )
+    head = {
+        "plan": plan._asdict(),
+        "seconds": time.perf_counter() - start,
+        "over_flows": over_flows,
+    }
     output.write_rows("coverage", head, "rows", rows)
 
 
 def flow_rows(plan: Plan, alpha: float, nu: float, rng: np.random.Generator) -> Iterator[dict]:
     """A row for every observable, sampled strain and number of seeds of one flow."""
     correlation_strain, samples = repeats(plan, alpha, nu)
-    average = partial(chosen_averages, area=samples.area[0], grains=plan.grains, shear_rate=samples.shear_rate[0])
+    average = partial(
+        chosen_averages, area=samples.area[0], grains=plan.grains, shear_rate=samples.shear_rate[0]
+    )
     for strain in STRAINS:
         tally = in_blocks(samples.tally, strain)
         truth = average(tally.total(axis=(0, 1)))
@@ -93,25 +111,43 @@ def flow_rows(plan: Plan, alpha: float, nu: float, rng: np.random.Generator) -> 
                 continue
             groups = [group for _ in range(seeds) for group in divided(rng, plan.repeats, seeds)]
             estimates = [standard_errors(average, picked(tally, one)) for one in groups]
-            head = {"restitution": alpha, "packing_fraction": nu, "correlation_strain": round(correlation_strain, 3)}
+            head = {
+                "restitution": alpha,
+                "packing_fraction": nu,
+                "correlation_strain": round(correlation_strain, 3),
+            }
             for observable in OBSERVABLES:
                 true = np.std(single[observable], ddof=1) / np.sqrt(seeds)
-                values, errors = np.array([[part[observable] for part in pair] for pair in estimates]).T
+                values, errors = np.array(
+                    [[part[observable] for part in pair] for pair in estimates]
+                ).T
                 deviations = (values - truth[observable]) / np.sqrt(1 - seeds / plan.repeats)
                 yield {
                     **head,
                     "observable": observable,
                     "strain": strain,
                     "seeds": seeds,
-                    "covered": round(float(np.mean(np.abs(deviations) < NORMAL_QUANTILE * errors)), 4),
+                    "covered": round(
+                        float(np.mean(np.abs(deviations) < NORMAL_QUANTILE * errors)), 4
+                    ),
                     "width": round(float(np.mean(errors / true)), 4),
                 }
 
 
 def judge_error(output: Output, error: float) -> None:
-    """Repeat a map with a requested error, print how often its intervals hold, and write ``coverage_error``."""
-    count, grains, start = (3, 64, time.perf_counter()) if output.quick else (40, 256, time.perf_counter())
-    given = {"grains": grains, "timestep": 1e-3, "tolerance": 1e-4, "error": error, "seeds": ERROR_SEEDS}
+    """Repeat a map with a requested error, print how often its intervals hold, and write
+    ``coverage_error``.
+    """
+    count, grains, start = (
+        (3, 64, time.perf_counter()) if output.quick else (40, 256, time.perf_counter())
+    )
+    given = {
+        "grains": grains,
+        "timestep": 1e-3,
+        "tolerance": 1e-4,
+        "error": error,
+        "seeds": ERROR_SEEDS,
+    }
     maps = []
     for repeat in range(count):
         with warnings.catch_warnings():
@@ -124,7 +160,9 @@ def judge_error(output: Output, error: float) -> None:
     limited = np.mean([one["seeds/status"] == Status.strain_limit for one in maps])
     rows = []
     for name in ERROR_OBSERVABLES:
-        values, errors = (np.stack([one[f"{name}{end}"] for one in maps]) for end in ("", "_stderr"))
+        values, errors = (
+            np.stack([one[f"{name}{end}"] for one in maps]) for end in ("", "_stderr")
+        )
         truth = np.sum(strain * values, axis=0) / np.sum(strain, axis=0)
         deviations = np.abs(values - truth) / np.sqrt(1 - 1 / count)
         for nu, alpha in np.ndindex(truth.shape):
@@ -137,28 +175,47 @@ def judge_error(output: Output, error: float) -> None:
                     "observable": name,
                     "covered": float(np.mean(inside)),
                     "width": float(np.mean(errors[place]) / np.std(values[place], ddof=1)),
-                    "relative_interval": float(np.mean(NORMAL_QUANTILE * errors[place] / truth[nu, alpha])),
+                    "relative_interval": float(
+                        np.mean(NORMAL_QUANTILE * errors[place] / truth[nu, alpha])
+                    ),
                     "strain": float(np.mean(strain[place])),
                 }
             )
     for name in ERROR_OBSERVABLES:
         covered = [row["covered"] for row in rows if row["observable"] == name]
         print(f"{name}: {np.mean(covered):.3f} of the intervals [{min(covered):.2f} at a point]")
-    print(f"{np.mean([row['covered'] for row in rows]):.3f} of all; {limited:.1%} of the seeds at their longest strain")
-    head = {"error": error, "grains": grains, "seeds": ERROR_SEEDS, "repeats": count, "limited": float(limited)}
-    output.write_rows("coverage_error", head | {"seconds": time.perf_counter() - start}, "rows", rows)
+    print(
+        f"{np.mean([row['covered'] for row in rows]):.3f} of all; {limited:.1%} of the seeds at "
+        "their longest strain"
+    )
+    head = {
+        "error": error,
+        "grains": grains,
+        "seeds": ERROR_SEEDS,
+        "repeats": count,
+        "limited": float(limited),
+    }
+    output.write_rows(
+        "coverage_error", head | {"seconds": time.perf_counter() - start}, "rows", rows
+    )
 
 
 def repeats(plan: Plan, alpha: float, nu: float) -> tuple[float, jg.Sample]:
     """Correlation strain of a flow, and its independent samples, with a leading axis of repeats."""
     flow = jg.ShearFlow(plan.grains, alpha, nu, plan.timestep)
-    state, pilot = jg.sample(flow, jg.prepare(flow, jax.random.key(plan.repeats), equilibrate=10.0), PILOT)
+    state, pilot = jg.sample(
+        flow, jg.prepare(flow, jax.random.key(plan.repeats), equilibrate=10.0), PILOT
+    )
     mass = float(np.sum(state.grains.masses))
-    correlation_strain = float(flow_correlation_strain(pilot.averages, plan.grains, mass, pilot.area, flow.shear_rate))
+    correlation_strain = float(
+        flow_correlation_strain(pilot.averages, plan.grains, mass, pilot.area, flow.shear_rate)
+    )
     samples = []
     for seed in range(plan.repeats):
         state = jg.prepare(flow, jax.random.key(seed), equilibrate=PREPARED * correlation_strain)
-        _, sample = jg.sample(flow, state, STRAINS[-1] * correlation_strain, BLOCKS * STRAINS[-1] // STRAINS[0])
+        _, sample = jg.sample(
+            flow, state, STRAINS[-1] * correlation_strain, BLOCKS * STRAINS[-1] // STRAINS[0]
+        )
         samples.append(jax.tree.map(np.asarray, sample))
     return correlation_strain, jax.tree.map(lambda *x: np.stack(x), *samples)
 
@@ -166,7 +223,9 @@ def repeats(plan: Plan, alpha: float, nu: float) -> tuple[float, jg.Sample]:
 def in_blocks(tally: Tally, strain: int) -> Tally:
     """The first correlation strains of all repeats in ``BLOCKS`` blocks, (repeats, blocks)."""
     merge = strain // STRAINS[0]
-    first = jax.tree.map(lambda x: x[:, : BLOCKS * merge].reshape(len(x), BLOCKS, merge, *x.shape[2:]), tally)
+    first = jax.tree.map(
+        lambda x: x[:, : BLOCKS * merge].reshape(len(x), BLOCKS, merge, *x.shape[2:]), tally
+    )
     return first.total(axis=2)
 
 
@@ -185,9 +244,18 @@ def chosen_averages(tally: Tally, **flow: float) -> dict[str, np.ndarray]:
 
 
 def means_over_flows(rows: list[dict]) -> Iterator[dict]:
-    """Shares and widths averaged over the flows, and the smallest share, by observable, strain and seeds."""
+    """Shares and widths averaged over the flows, and the smallest share, by observable, strain and
+    seeds.
+    """
     keys = ("observable", "strain", "seeds")
     for values in dict.fromkeys(tuple(row[key] for key in keys) for row in rows):
         same = [row for row in rows if tuple(row[key] for key in keys) == values]
-        means = {name: round(float(np.mean([row[name] for row in same])), 4) for name in ("covered", "width")}
-        yield dict(zip(keys, values, strict=True)) | means | {"least_covered": min(row["covered"] for row in same)}
+        means = {
+            name: round(float(np.mean([row[name] for row in same])), 4)
+            for name in ("covered", "width")
+        }
+        yield (
+            dict(zip(keys, values, strict=True))
+            | means
+            | {"least_covered": min(row["covered"] for row in same)}
+        )

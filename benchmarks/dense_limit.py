@@ -1,20 +1,20 @@
 """Are dense flows compatible with the exponents that are published for the jamming transition?
 
-Reads the 16 flows of ``python -m benchmarks dense_rheology`` (N = 1000, 0.79 ≤ ν ≤ 0.83) and those of ``dense_flows``
-(N = 4000, from ν = 0.83 on), and fits packing fraction and friction by
+Reads the 16 flows of ``python -m benchmarks dense_rheology`` (N = 1000, 0.79 ≤ ν ≤ 0.83) and those
+of ``dense_flows`` (N = 4000, from ν = 0.83 on), and fits packing fraction and friction by
 
     ν(I) = ν_c − k I^c − k₂ I^d,        μ(I) = μ₀ + a I^c + a₂ I^d,
 
-with c fixed to 0.40, which is 2/β with β = 5.0 ± 0.4 (Vågberg, Olsson and Teitel, Phys. Rev. E 93, 052902, 2016), or to
-0.35 (DeGiuli, Düring, Lerner and Wyart, Phys. Rev. E 91, 062206, 2015), and with the correction to scaling d fixed to
-2c or to 1; the spread over these choices is the model error. A fit whose k is negative contradicts its law. Beside
-them stand the fits of one power law with a free exponent, to all flows and without the loosest: an exponent that goes
-on falling is an effective one.
-The exponent δ of p/T ∝ (ν_c − ν)^(−δ) is fitted with each ν_c; 2 is published (Otsuki, Hayakawa and Luding, Prog.
-Theor. Phys. Suppl. 184, 110, 2010).
+with c fixed to 0.40, which is 2/β with β = 5.0 ± 0.4 (Vågberg, Olsson and Teitel, Phys. Rev. E 93,
+052902, 2016), or to 0.35 (DeGiuli, Düring, Lerner and Wyart, Phys. Rev. E 91, 062206, 2015), and
+with the correction to scaling d fixed to 2c or to 1; the spread over these choices is the model
+error. A fit whose k is negative contradicts its law. Beside them stand the fits of one power law
+with a free exponent, to all flows and without the loosest: an exponent that goes on falling is an
+effective one. The exponent δ of p/T ∝ (ν_c − ν)^(−δ) is fitted with each ν_c; 2 is published
+(Otsuki, Hayakawa and Luding, Prog. Theor. Phys. Suppl. 184, 110, 2010).
 
-Least squares with the effective variance, that of the ordinate plus that of I times the squared slope; the correlation
-of the errors of μ and I, which the file does not hold, is left out.
+Least squares with the effective variance, that of the ordinate plus that of I times the squared
+slope; the correlation of the errors of μ and I, which the file does not hold, is left out.
 
     python -m benchmarks dense_limit   # a second
 """
@@ -28,25 +28,45 @@ from matplotlib.figure import Figure
 
 from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
-from jaxgran.plotting.drawing import NU_LABEL, SMALL_SIZE, TWO_COLUMNS, curve_styles, label_log_axis, styled
+from jaxgran.plotting.drawing import (
+    NU_LABEL,
+    SMALL_SIZE,
+    TWO_COLUMNS,
+    curve_styles,
+    label_log_axis,
+    styled,
+)
 
 EXPONENTS = (0.40, 0.35)
 LOOSEST = (0.79, 0.81, 0.82)  # smallest packing fraction of a fit with a free exponent
 ROUNDS = 30  # of the effective variance
-LEAST_EXPONENT, LARGEST_EXPONENT = 0.05, 4.0  # of a free fit; an exponent at a bound is not determined
+LEAST_EXPONENT, LARGEST_EXPONENT = (
+    0.05,
+    4.0,
+)  # of a free fit; an exponent at a bound is not determined
 
 
 class Fit(NamedTuple):
     """A fit of y = offset + Σ coefficient · I^exponent."""
 
     offset: float
-    offset_error: float  # standard error; times the square root of the reduced χ² where that is above one
+    offset_error: (
+        float  # standard error; times the square root of the reduced χ² where that is above one
+    )
     coefficients: tuple[float, ...]  # of the powers
     reduced_chi_squared: float
 
 
-def fit(number: np.ndarray, number_error: np.ndarray, y: np.ndarray, y_error: np.ndarray, *exponents: float) -> Fit:
-    """Fit the offset and a coefficient for each exponent to points with errors in both coordinates."""
+def fit(
+    number: np.ndarray,
+    number_error: np.ndarray,
+    y: np.ndarray,
+    y_error: np.ndarray,
+    *exponents: float,
+) -> Fit:
+    """Fit the offset and a coefficient for each exponent to points with errors in both
+    coordinates.
+    """
     design = np.stack([np.ones_like(number), *(number**p for p in exponents)], axis=1)
     slopes = np.stack([np.zeros_like(number), *(p * number ** (p - 1) for p in exponents)], axis=1)
     constants, *_ = weighted_fit(design, y, np.ones_like(y))
@@ -54,7 +74,9 @@ def fit(number: np.ndarray, number_error: np.ndarray, y: np.ndarray, y_error: np
         deviation = np.hypot(y_error, slopes @ constants * number_error)
         constants, covariance, chi_squared = weighted_fit(design, y, deviation)
     reduced = chi_squared / (len(y) - len(constants))
-    return Fit(constants[0], np.sqrt(covariance[0, 0] * max(1.0, reduced)), tuple(constants[1:]), reduced)
+    return Fit(
+        constants[0], np.sqrt(covariance[0, 0] * max(1.0, reduced)), tuple(constants[1:]), reduced
+    )
 
 
 def ratio_exponent(points: dict[str, np.ndarray], critical: float) -> tuple[float, float]:
@@ -63,7 +85,9 @@ def ratio_exponent(points: dict[str, np.ndarray], critical: float) -> tuple[floa
         points["pressure_stderr"] / points["pressure"],
         points["granular_temperature_stderr"] / points["granular_temperature"],
     )
-    design = np.stack([np.ones_like(relative), -np.log(critical - points["packing_fraction"])], axis=1)
+    design = np.stack(
+        [np.ones_like(relative), -np.log(critical - points["packing_fraction"])], axis=1
+    )
     logarithm = np.log(points["pressure"] / points["granular_temperature"])
     constants, covariance, chi_squared = weighted_fit(design, logarithm, relative)
     reduced = max(1.0, chi_squared / (len(relative) - 2))
@@ -71,10 +95,15 @@ def ratio_exponent(points: dict[str, np.ndarray], critical: float) -> tuple[floa
 
 
 def free_fit(points: dict[str, np.ndarray], ordinate: str) -> dict[str, Any]:
-    """Offset and exponent of one power law of I, each with its standard error, and the reduced χ²."""
+    """Offset and exponent of one power law of I, each with its standard error, and the reduced
+    χ².
+    """
     number, number_error = points["inertial_number"], points["inertial_number_stderr"]
     exact = np.zeros_like(number)
-    error, sign = points.get(f"{ordinate}_stderr", exact), -1.0 if ordinate == "packing_fraction" else 1.0
+    error, sign = (
+        points.get(f"{ordinate}_stderr", exact),
+        -1.0 if ordinate == "packing_fraction" else 1.0,
+    )
     (offset, exponent), (offset_error, exponent_error), chi_squared = fit_power_law(
         number, points[ordinate], number_error, error, sign
     )
@@ -89,16 +118,25 @@ def free_fit(points: dict[str, np.ndarray], ordinate: str) -> dict[str, Any]:
 def fit_power_law(
     x: np.ndarray, y: np.ndarray, x_error: np.ndarray, y_error: np.ndarray, sign: float
 ) -> tuple[tuple[float, float], tuple[float, float], float]:
-    """Offset and exponent of y = offset ± coefficient · x^exponent, their standard errors, and the reduced χ²."""
+    """Offset and exponent of y = offset ± coefficient · x^exponent, their standard errors, and the
+    reduced χ².
+    """
     scale = x.max()  # so that coefficient and offset are of similar size
-    parameters, covariance, deviation = np.array([y[x.argmin()], max(np.ptp(y), 1e-3), 0.5]), np.eye(3), y_error
+    parameters, covariance, deviation = (
+        np.array([y[x.argmin()], max(np.ptp(y), 1e-3), 0.5]),
+        np.eye(3),
+        y_error,
+    )
 
     def law(number, offset, coefficient, exponent):
         return offset + sign * coefficient * number**exponent
 
     def slopes(number, _, coefficient, exponent):
         power = number**exponent
-        return np.stack([np.ones_like(number), sign * power, sign * coefficient * power * np.log(number)], axis=-1)
+        return np.stack(
+            [np.ones_like(number), sign * power, sign * coefficient * power * np.log(number)],
+            axis=-1,
+        )
 
     for _ in range(ROUNDS):
         previous, (_, coefficient, exponent) = parameters, parameters
@@ -112,16 +150,28 @@ def fit_power_law(
             break
     chi_squared = float(np.sum(((y - law(x / scale, *parameters)) / deviation) ** 2) / (len(x) - 3))
     errors = np.sqrt(np.diagonal(covariance) * max(1.0, chi_squared))
-    return (float(parameters[0]), float(parameters[2])), (float(errors[0]), float(errors[2])), chi_squared
+    return (
+        (float(parameters[0]), float(parameters[2])),
+        (float(errors[0]), float(errors[2])),
+        chi_squared,
+    )
 
 
 def free_fits(points: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    """The fits of one power law to packing fraction and friction, a row for each smallest packing fraction."""
+    """The fits of one power law to packing fraction and friction, a row for each smallest packing
+    fraction.
+    """
     rows = []
     for least in LOOSEST:
-        chosen = {name: values[points["packing_fraction"] >= least] for name, values in points.items()}
-        laws = {name: free_fit(chosen, name) for name in ("packing_fraction", "macroscopic_friction")}
-        rows.append({"least_packing_fraction": least, "points": len(chosen["packing_fraction"]), **laws})
+        chosen = {
+            name: values[points["packing_fraction"] >= least] for name, values in points.items()
+        }
+        laws = {
+            name: free_fit(chosen, name) for name in ("packing_fraction", "macroscopic_friction")
+        }
+        rows.append(
+            {"least_packing_fraction": least, "points": len(chosen["packing_fraction"]), **laws}
+        )
     return rows
 
 
@@ -132,7 +182,9 @@ def corrected_fits(points: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     rows = []
     for exponent in EXPONENTS:
         for correction in (2 * exponent, 1.0):
-            fraction = fit(number, number_error, points["packing_fraction"], exact, exponent, correction)
+            fraction = fit(
+                number, number_error, points["packing_fraction"], exact, exponent, correction
+            )
             friction = fit(
                 number,
                 number_error,
@@ -146,7 +198,9 @@ def corrected_fits(points: dict[str, np.ndarray]) -> list[dict[str, Any]]:
                 "friction_at_onset": list(friction[:2]),
                 "leading_coefficients": [-fraction.coefficients[0], friction.coefficients[0]],
                 "reduced_chi_squared": [fraction.reduced_chi_squared, friction.reduced_chi_squared],
-                "exponent_of_pressure_over_temperature": list(ratio_exponent(points, fraction.offset)),
+                "exponent_of_pressure_over_temperature": list(
+                    ratio_exponent(points, fraction.offset)
+                ),
             }
             rows.append({"exponent": exponent, "correction": correction, **rounded(found, 5)})
     return rows
@@ -154,7 +208,9 @@ def corrected_fits(points: dict[str, np.ndarray]) -> list[dict[str, Any]]:
 
 @styled
 def draw(points: dict[str, np.ndarray], free: list[dict[str, Any]]) -> Figure:
-    """Friction and packing fraction against the inertial number, with one power law and two of published exponents."""
+    """Friction and packing fraction against the inertial number, with one power law and two of
+    published exponents.
+    """
     figure = Figure(figsize=(TWO_COLUMNS, 3.1), layout="constrained")
     panels = figure.subplots(1, 2)
     flows = {
@@ -173,7 +229,14 @@ def draw(points: dict[str, np.ndarray], free: list[dict[str, Any]]) -> Figure:
         for (title, exponents), line in zip(powers.items(), ("-", "--", ":"), strict=True):
             law = fit(number, number_error, points[name], error, *exponents)
             terms = (a * along**p for a, p in zip(law.coefficients, exponents, strict=True))
-            axes.plot(along, law.offset + sum(terms), color="0.35", linestyle=line, linewidth=1, label=title)
+            axes.plot(
+                along,
+                law.offset + sum(terms),
+                color="0.35",
+                linestyle=line,
+                linewidth=1,
+                label=title,
+            )
         for (title, chosen), style in zip(flows.items(), curve_styles(len(flows)), strict=True):
             style |= {"linestyle": "none", "markersize": 4, "label": title}
             bars = {"xerr": number_error[chosen], "yerr": error[chosen]}
@@ -181,13 +244,18 @@ def draw(points: dict[str, np.ndarray], free: list[dict[str, Any]]) -> Figure:
         axes.set(xscale="log", xlabel="inertial number $I$", ylabel=label)
         label_log_axis(axes.xaxis)
     handles, names = panels[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=SMALL_SIZE, frameon=False)
+    figure.legend(
+        handles, names, loc="outside lower center", ncols=3, fontsize=SMALL_SIZE, frameon=False
+    )
     return figure
 
 
 def measured() -> tuple[list[str], dict[str, np.ndarray]]:
     """Commits of the two studies, and the averages of their flows whose status is ok."""
-    studies = [json.loads((RESULTS / f"{name}.json").read_text()) for name in ("dense_rheology", "dense_flows")]
+    studies = [
+        json.loads((RESULTS / f"{name}.json").read_text())
+        for name in ("dense_rheology", "dense_flows")
+    ]
     flows = []
     for study in studies:
         grains = study["grains"] if "grains" in study else study["plan"]["grains"]

@@ -1,8 +1,10 @@
-"""A batch of replicas on the device that JAX finds, beside one core of the numba rival; and the map of the paper.
+"""A batch of replicas on the device that JAX finds, beside one core of the numba rival; and the map
+of the paper.
 
-1000 replicas of 256 grains are advanced from the same states by what jaxgran takes for this device, by the plain
-advance, and, a few of them, by the rival. Replica-steps per second are printed and written as JSON, with the peak of
-the device's memory where it tells. ``--paper`` adds the seconds of ``jaxgran map --preset paper``.
+1000 replicas of 256 grains are advanced from the same states by what jaxgran takes for this device,
+by the plain advance, and, a few of them, by the rival. Replica-steps per second are printed and
+written as JSON, with the peak of the device's memory where it tells. ``--paper`` adds the seconds
+of ``jaxgran map --preset paper``.
 
     python -m benchmarks device_batch                    # a processor: 3 minutes
     python -m benchmarks device_batch --quick            # under a minute
@@ -31,17 +33,26 @@ DISTINCT, APART = 16, 0.5  # states of a batch, and the strain between them
 
 
 def run(output: Output, paper: bool = False) -> None:
-    """Compare at every point, print, and write JSON; with the map of the paper where it is asked for."""
-    replicas, points, timesteps = (64, POINTS[:2], TIMESTEPS[:1]) if output.quick else (REPLICAS, POINTS, TIMESTEPS)
+    """Compare at every point, print, and write JSON; with the map of the paper where it is asked
+    for.
+    """
+    replicas, points, timesteps = (
+        (64, POINTS[:2], TIMESTEPS[:1]) if output.quick else (REPLICAS, POINTS, TIMESTEPS)
+    )
     device = jax.local_devices()[0]
     print(f"{jax.device_count()} × {device.device_kind}, {replicas} replicas of {GRAINS} grains")
-    print("     dt     α     ν   taken: replica-steps/s   plain    one core of the rival   taken/rival")
+    print(
+        "     dt     α     ν   taken: replica-steps/s   plain    one core of the rival   "
+        "taken/rival"
+    )
     rows = []
     for dt in timesteps:
         for alpha, nu in points:
             rows.append(compare(alpha, nu, dt, replicas))
             print(
-                "{dt:7.0e}{alpha:6.2g}{nu:6.2g}{taken:23.3g}{plain:11.3g}{rival:17.3g}{ratio:14.1f}".format(**rows[-1])
+                "{dt:7.0e}{alpha:6.2g}{nu:6.2g}{taken:23.3g}{plain:11.3g}{rival:17.3g}{ratio:14.1f}".format(
+                    **rows[-1]
+                )
             )
     result = {
         "hardware": output.hardware | {"device": device.device_kind, "devices": jax.device_count()},
@@ -62,8 +73,12 @@ def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
     flow = jg.ShearFlow(grains=GRAINS, restitution=alpha, packing_fraction=nu, timestep=dt)
     state = jg.prepare(flow, jax.random.key(0), equilibrate=5.0)
     forward = jax.jit(jg.advance)
-    distinct = [state := forward(flow, state, jnp.int32(round(APART / dt)))[0] for _ in range(DISTINCT)]
-    batch = jax.tree.map(lambda *x: jnp.stack([x[n % DISTINCT] for n in range(replicas)]), *distinct)
+    distinct = [
+        state := forward(flow, state, jnp.int32(round(APART / dt)))[0] for _ in range(DISTINCT)
+    ]
+    batch = jax.tree.map(
+        lambda *x: jnp.stack([x[n % DISTINCT] for n in range(replicas)]), *distinct
+    )
     flows = jax.tree.map(lambda x: jnp.full(replicas, x), flow)
     steps, numerics = round(STRAIN / dt), for_replicas(DEFAULT_NUMERICS, replicas)
     few = steps // PLAIN_SHARE
@@ -84,10 +99,19 @@ def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
                 seconds[name].append(time.perf_counter() - start)
     speeds = {name: done / min(seconds[name]) for name, (_, done) in ways.items()}
     taken = select_engine(flow, DEFAULT_NUMERICS, state).name
-    return {"alpha": alpha, "nu": nu, "dt": dt, "engine": taken, **speeds, "ratio": speeds["taken"] / speeds["rival"]}
+    return {
+        "alpha": alpha,
+        "nu": nu,
+        "dt": dt,
+        "engine": taken,
+        **speeds,
+        "ratio": speeds["taken"] / speeds["rival"],
+    }
 
 
-def _plain_replica(flow: jg.ShearFlow, state: jg.State, steps: jax.Array) -> tuple[jg.State, jg.Tally]:
+def _plain_replica(
+    flow: jg.ShearFlow, state: jg.State, steps: jax.Array
+) -> tuple[jg.State, jg.Tally]:
     return jg.advance(flow, state, steps, engine=jg.Jax())
 
 
@@ -102,5 +126,7 @@ def rivals(flow: jg.ShearFlow, states: list[jg.State], steps: int) -> None:
 def paper_map() -> float:
     """Seconds of the map of the paper, with a worker for each core of a processor."""
     start = time.perf_counter()
-    jg.ratio_map(**PRESETS["paper"], workers=usable_cores() if jax.default_backend() == "cpu" else 1)
+    jg.ratio_map(
+        **PRESETS["paper"], workers=usable_cores() if jax.default_backend() == "cpu" else 1
+    )
     return time.perf_counter() - start

@@ -1,11 +1,13 @@
-"""How far Enskog's dissipation rate is from the measured one, and the theory that follows from a law of it.
+"""How far Enskog's dissipation rate is from the measured one, and the theory that follows from a
+law of it.
 
-From the reference map (N = 6400 and 1600, dt = 1e-4): the dissipation rate Γ, which is the power of the shear in a
-steady flow, Enskog's Γ_E at the measured temperature tensor scaled to the local temperature, and the lengths L = Γ_E/Γ
-and L′ = (Γ_E/p_E)/(Γ/p) with the contact pressure p; and the same from the map of the paper (N = 1000, dt = 1e-5). Laws
-of L up to ν = 0.75, and laws of L′ and p/p_E for all flows, are fitted to the reference map, with each restitution or
-packing fraction left out in turn, and judged on the paper's map and on one of 30 other flows (N = 1600, dt = 3e-4),
-which also judge the temperature and the stresses of ``corrected_shear``.
+From the reference map (N = 6400 and 1600, dt = 1e-4): the dissipation rate Γ, which is the power of
+the shear in a steady flow, Enskog's Γ_E at the measured temperature tensor scaled to the local
+temperature, and the lengths L = Γ_E/Γ and L′ = (Γ_E/p_E)/(Γ/p) with the contact pressure p; and the
+same from the map of the paper (N = 1000, dt = 1e-5). Laws of L up to ν = 0.75, and laws of L′ and
+p/p_E for all flows, are fitted to the reference map, with each restitution or packing fraction left
+out in turn, and judged on the paper's map and on one of 30 other flows (N = 1600, dt = 3e-4), which
+also judge the temperature and the stresses of ``corrected_shear``.
 
     python -m benchmarks dissipation           # four minutes on two cores
     python -m benchmarks dissipation --quick   # judged on smaller flows, one minute
@@ -44,7 +46,10 @@ JUDGED = {
 }
 """A map without a restitution or a packing fraction of the fitted one."""
 SMALLER = {"grains": 64}
-CORRECTIONS = {"length": (correlation_length, "length_from_pressure"), "pairs": (pair_factor, "pair_factor")}
+CORRECTIONS = {
+    "length": (correlation_length, "length_from_pressure"),
+    "pairs": (pair_factor, "pair_factor"),
+}
 START = {"length": (0.2, 0.02, 1.5), "pairs": (0.3, 0.02, 1.5)}
 PREDICTED = {
     "local_temperature": "granular_temperature",
@@ -52,10 +57,22 @@ PREDICTED = {
     "shear_stress": "shear_stress",
 }
 """What is measured, by its name here, and the field of the corrected theory that predicts it."""
-corrected = jax.jit(jax.vmap(lambda laws, alpha, nu: corrected_shear(alpha, nu, laws=laws), (None, 0, 0)))
+corrected = jax.jit(
+    jax.vmap(lambda laws, alpha, nu: corrected_shear(alpha, nu, laws=laws), (None, 0, 0))
+)
 DENSEST = 0.75  # packing fraction up to which laws of L are fitted
-MODERATE = (0.3, 0.7)  # packing fractions between which errors of pressure and temperature are compared
-LENGTHS = ("alpha", "nu", "dissipation", "dissipation_error", "length_from_pressure", "length_from_pressure_error")
+MODERATE = (
+    0.3,
+    0.7,
+)  # packing fractions between which errors of pressure and temperature are compared
+LENGTHS = (
+    "alpha",
+    "nu",
+    "dissipation",
+    "dissipation_error",
+    "length_from_pressure",
+    "length_from_pressure_error",
+)
 WITHIN = (0.05, 0.1, 0.2)  # relative errors of the theory that are counted
 THEORY = ("pressure", "shear_stress", "granular_temperature")
 DRAWN = (0.1, 0.3, 0.5, 0.7, 0.9)  # restitutions
@@ -81,13 +98,19 @@ def run(output: Output) -> None:
         print(name, *(f"  {key}: {rounded(x, 4)}" for key, x in one.items()), sep="\n")
     print("   ν     α        Γ/Γ_E             L′           L′√chaos   binary   chaos")
     rows, paper_rows, judged_rows = (
-        [{name: rounded(float(x[k]), 4) for name, x in some.items()} for k in range(some["alpha"].size)]
+        [
+            {name: rounded(float(x[k]), 4) for name, x in some.items()}
+            for k in range(some["alpha"].size)
+        ]
         for some in (points, paper, judged)
     )
     for one in rows:
         print(
-            "{nu:5.2f}{alpha:6.2f}{dissipation:8.3f} ± {dissipation_error:.3f}{length_from_pressure:9.3f} ± "
-            "{length_from_pressure_error:.3f}{times_root_chaos:9.3f}{binary:9.3f}{chaos:8.3f}".format(**one)
+            "{nu:5.2f}{alpha:6.2f}{dissipation:8.3f} ± "
+            "{dissipation_error:.3f}{length_from_pressure:9.3f} ± "
+            "{length_from_pressure_error:.3f}{times_root_chaos:9.3f}{binary:9.3f}{chaos:8.3f}".format(
+                **one
+            )
         )
     heads = {
         name: {"points": some["nu"].size, "timestep": float(one.attrs["timestep"])} | sizes_of(one)
@@ -107,7 +130,10 @@ def sizes_of(data: xr.DataTree) -> dict[str, int]:
 
 def keep(row: dict[str, float]) -> dict[str, float]:
     """What a prediction of the flow is compared with."""
-    return {name: row[name] for name in ("alpha", "nu", *PREDICTED, "length_from_pressure", "pair_factor")}
+    return {
+        name: row[name]
+        for name in ("alpha", "nu", *PREDICTED, "length_from_pressure", "pair_factor")
+    }
 
 
 def of_rows(rows: list[dict[str, float]]) -> Points:
@@ -116,15 +142,23 @@ def of_rows(rows: list[dict[str, float]]) -> Points:
 
 
 def compared(data: xr.Dataset) -> Points:
-    """Measured rates over Enskog's, lengths and temperatures at the points of a map that have the status ok."""
+    """Measured rates over Enskog's, lengths and temperatures at the points of a map that have the
+    status ok.
+    """
     ok = data.status.values == 0
-    nu, alpha = (x[ok] for x in np.broadcast_arrays(data.packing_fraction.values[:, None], data.restitution.values))
+    nu, alpha = (
+        x[ok]
+        for x in np.broadcast_arrays(data.packing_fraction.values[:, None], data.restitution.values)
+    )
 
     def value(name: str) -> np.ndarray:
         return data[name].values[ok]
 
     local, length = value("local_granular_temperature"), value("theory/correlation_length")
-    by_pressure, chaos = value("theory/correlation_length_from_pressure"), value("theory/enskog_factor_pressure_chaos")
+    by_pressure, chaos = (
+        value("theory/correlation_length_from_pressure"),
+        value("theory/enskog_factor_pressure_chaos"),
+    )
     of_temperature = value("theory/enskog_factor_pressure_local_temperature")
     stress, enskog = value("stresses/contact_stress"), value("theory/enskog_pressure")
     contact = (stress[..., 0, 0] + stress[..., 1, 1]) / 2
@@ -151,7 +185,9 @@ def compared(data: xr.Dataset) -> Points:
 
 
 def counts(points: Points) -> dict[str, int]:
-    """Numbers of points of which something is said on the pages, by the local and by the granular temperature."""
+    """Numbers of points of which something is said on the pages, by the local and by the granular
+    temperature.
+    """
     binary = abs(points["binary"] - 1) < 0.01
 
     def near(name: str) -> int:
@@ -168,25 +204,35 @@ def counts(points: Points) -> dict[str, int]:
 
 
 def errors_of_theory(points: Points) -> dict:
-    """Points whose pressure, shear stress and temperatures the moments predict, and how errors of both are related."""
+    """Points whose pressure, shear stress and temperatures the moments predict, and how errors of
+    both are related.
+    """
     names = (*(f"{name}_over_theory" for name in THEORY), "local_temperature_over_theory")
-    found: dict = {name: [int(np.sum(abs(1 / points[name] - 1) < share)) for share in WITHIN] for name in names}
+    found: dict = {
+        name: [int(np.sum(abs(1 / points[name] - 1) < share)) for share in WITHIN] for name in names
+    }
     moderate = (points["nu"] >= MODERATE[0]) & (points["nu"] <= MODERATE[1])
     for name in ("pressure_over_theory", "shear_stress_over_theory"):
         x, y = (-np.log(points[one][moderate]) for one in ("local_temperature_over_theory", name))
         slope, _ = np.polyfit(x, y, 1)
-        found[f"{name}_against_local_temperature"] = {"correlation": np.corrcoef(x, y)[0, 1], "slope": slope}
+        found[f"{name}_against_local_temperature"] = {
+            "correlation": np.corrcoef(x, y)[0, 1],
+            "slope": slope,
+        }
     return found
 
 
-# ----------------------------------------------------------------------------------------------- laws of L
+# -----------------------------------------------------------------------------------------------
+# laws of L
 
 LAWS: dict[str, tuple[Callable[[Points, np.ndarray], np.ndarray], tuple[float, ...]]] = {
     "1": (lambda p, c: np.ones_like(p["nu"]), ()),
     "max(1, c G^(1/3) S)": (lambda p, c: np.maximum(1, c[0] * over_shear(p)), (0.5,)),
     "max(1, c X^k)": (lambda p, c: np.maximum(1, c[0] * dissipative_rate(p) ** c[1]), (1.1, 0.3)),
 }
-"""Laws of L by their formula, with G = νχ, S = γ̇σ/√(T/m), T the local temperature and X = (1 − α) G^(1/3) S."""
+"""Laws of L by their formula, with G = νχ, S = γ̇σ/√(T/m), T the local temperature and
+X = (1 − α) G^(1/3) S.
+"""
 
 
 def density(points: Points) -> np.ndarray:
@@ -205,13 +251,19 @@ def dissipative_rate(points: Points) -> np.ndarray:
 
 
 def laws_of_length(points: Points, judged: Points) -> dict[str, dict]:
-    """Coefficients of each law, and the rms of its error in ln L: fitted, with a packing fraction left out, judged."""
+    """Coefficients of each law, and the rms of its error in ln L: fitted, with a packing fraction
+    left out, judged.
+    """
     points, judged = (only(one, one["nu"] <= DENSEST) for one in (points, judged))
     found = {}
     for name, (law, start) in LAWS.items():
         coefficients = fitted(law, start, points)
         left_out = [
-            misfit(law, fitted(law, start, only(points, points["nu"] != nu)), only(points, points["nu"] == nu))
+            misfit(
+                law,
+                fitted(law, start, only(points, points["nu"] != nu)),
+                only(points, points["nu"] == nu),
+            )
             for nu in np.unique(points["nu"])
         ]
         found[name] = {
@@ -243,18 +295,22 @@ def rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
-# ----------------------------------------------------------------------------------------------- corrected theory
+# -----------------------------------------------------------------------------------------------
+# corrected theory
 
 
 def fitted_laws(points: Points) -> tuple[CorrelationLaws, dict[str, float]]:
-    """The laws of L′ and of the pairs at contact with the least squares of their logarithms, and the rms of each.
+    """The laws of L′ and of the pairs at contact with the least squares of their logarithms, and
+    the rms of each.
 
     A point counts as much as the area of the plane of ln(1 − α) and ν that it stands for.
     """
     laws, rms_of, roots = MEASURED_LAWS, {}, np.sqrt(areas(points["alpha"], points["nu"]))
     for name in CORRECTIONS:
 
-        def weighted(coefficients: np.ndarray, laws: CorrelationLaws = laws, name: str = name) -> np.ndarray:
+        def weighted(
+            coefficients: np.ndarray, laws: CorrelationLaws = laws, name: str = name
+        ) -> np.ndarray:
             return roots * law_misfit(laws, points, name, coefficients)
 
         found = least_squares(weighted, START[name], x_scale="jac", bounds=(0, np.inf))
@@ -266,7 +322,9 @@ def fitted_laws(points: Points) -> tuple[CorrelationLaws, dict[str, float]]:
 
 
 def areas(alphas: np.ndarray, nus: np.ndarray) -> np.ndarray:
-    """The area of the plane of ln(1 − α) and ν that each point of a grid stands for, over the mean."""
+    """The area of the plane of ln(1 − α) and ν that each point of a grid stands for, over the
+    mean.
+    """
     found = np.ones(nus.size)
     for x in (-np.log(1 - alphas), nus):
         values, place = np.unique(x, return_inverse=True)
@@ -274,7 +332,9 @@ def areas(alphas: np.ndarray, nus: np.ndarray) -> np.ndarray:
     return found / found.mean()
 
 
-def law_misfit(laws: CorrelationLaws, points: Points, name: str, coefficients: np.ndarray | None = None) -> np.ndarray:
+def law_misfit(
+    laws: CorrelationLaws, points: Points, name: str, coefficients: np.ndarray | None = None
+) -> np.ndarray:
     """Logarithm of a law over what is measured, with other coefficients where they are given."""
     law, measured = CORRECTIONS[name]
     laws = laws if coefficients is None else replace(laws, **{name: coefficients})
@@ -285,33 +345,49 @@ def misfits(laws: CorrelationLaws, points: Points) -> dict[str, np.ndarray]:
     """Logarithms of the laws over what is measured, and the same of the corrected theory."""
     shear = corrected(laws, points["alpha"], points["nu"])
     return {name: law_misfit(laws, points, name) for name in CORRECTIONS} | {
-        name: np.log(np.asarray(getattr(shear, field)) / points[name]) for name, field in PREDICTED.items()
+        name: np.log(np.asarray(getattr(shear, field)) / points[name])
+        for name, field in PREDICTED.items()
     }
 
 
 def corrected_theory(data: xr.DataTree, points: Points, others: dict[str, Points]) -> dict:
-    """The laws, and errors with an inner restitution or packing fraction, or the densest, left out, and elsewhere."""
+    """The laws, and errors with an inner restitution or packing fraction, or the densest, left out,
+    and elsewhere.
+    """
     laws, of_fit = fitted_laws(points)
     judged = others["judged_on"]
     found: dict = {
         "laws": {
-            **{name: np.asarray(getattr(laws, name)).tolist() for name in ("length", "length_stderr")},
-            **{name: np.asarray(getattr(laws, name)).tolist() for name in ("pairs", "pairs_stderr")},
+            **{
+                name: np.asarray(getattr(laws, name)).tolist()
+                for name in ("length", "length_stderr")
+            },
+            **{
+                name: np.asarray(getattr(laws, name)).tolist() for name in ("pairs", "pairs_stderr")
+            },
             "scatter": [rms(misfits(laws, judged)[name]) for name in PREDICTED],
         },
         "rms_of_fit": of_fit,
         "rms_judged": {name: rms(misfits(laws, judged)[name]) for name in CORRECTIONS},
     }
-    inner, densest = {axis: np.unique(points[axis])[1:-1] for axis in ("alpha", "nu")}, points["nu"].max()
+    inner, densest = (
+        {axis: np.unique(points[axis])[1:-1] for axis in ("alpha", "nu")},
+        points["nu"].max(),
+    )
     for kind, axis, values in (
         ("alpha_left_out", "alpha", inner["alpha"]),
         ("nu_left_out", "nu", inner["nu"]),
         ("densest_left_out", "nu", [densest]),
     ):
         left_out = [
-            misfits(fitted_laws(only(points, points[axis] != x))[0], only(points, points[axis] == x)) for x in values
+            misfits(
+                fitted_laws(only(points, points[axis] != x))[0], only(points, points[axis] == x)
+            )
+            for x in values
         ]
-        found[f"rms_{kind}"] = {name: rms(np.concatenate([one[name] for one in left_out])) for name in left_out[0]}
+        found[f"rms_{kind}"] = {
+            name: rms(np.concatenate([one[name] for one in left_out])) for name in left_out[0]
+        }
     none = np.zeros(3)
     variants = {
         "enskog": replace(laws, length=none, pairs=none),
@@ -325,7 +401,11 @@ def corrected_theory(data: xr.DataTree, points: Points, others: dict[str, Points
         found[name] = {
             part: {"points": int(chosen.sum())}
             | {
-                key: {quantity: summary(one[quantity][chosen]) for quantity in PREDICTED if quantity in one}
+                key: {
+                    quantity: summary(one[quantity][chosen])
+                    for quantity in PREDICTED
+                    if quantity in one
+                }
                 for key, one in errors.items()
             }
             for part, chosen in within.items()
@@ -334,25 +414,41 @@ def corrected_theory(data: xr.DataTree, points: Points, others: dict[str, Points
 
 
 def in_core(points: Points) -> np.ndarray:
-    """Flows between the restitutions and packing fractions of the map that ``jaxgran map`` makes first."""
-    spans = (points["alpha"], PRESETS["quick"]["restitution"]), (points["nu"], PRESETS["quick"]["packing_fraction"])
+    """Flows between the restitutions and packing fractions of the map that ``jaxgran map`` makes
+    first.
+    """
+    spans = (
+        (points["alpha"], PRESETS["quick"]["restitution"]),
+        (points["nu"], PRESETS["quick"]["packing_fraction"]),
+    )
     inside = [(x >= min(span) - 1e-9) & (x <= max(span) + 1e-9) for x, span in spans]
     return inside[0] & inside[1]
 
 
 def summary(errors: np.ndarray) -> dict:
-    """Rms of the logarithms of predicted over measured, and numbers of points within relative errors."""
-    return {"rms": rms(errors), "within": [int(np.sum(abs(np.expm1(errors)) < share)) for share in WITHIN]}
+    """Rms of the logarithms of predicted over measured, and numbers of points within relative
+    errors.
+    """
+    return {
+        "rms": rms(errors),
+        "within": [int(np.sum(abs(np.expm1(errors)) < share)) for share in WITHIN],
+    }
 
 
-# ----------------------------------------------------------------------------------------------- checks, output
+# -----------------------------------------------------------------------------------------------
+# checks, output
 
 
 def balance(data: xr.Dataset) -> dict[str, float]:
     """Γ over the power of the shear, and the share of Γ that binary collisions would have."""
     ok = data.status.values == 0
     dissipation, shear = data["stresses/dissipation_rate"].values[ok], data.shear_stress.values[ok]
-    errors = np.hypot(*(data[f"{name}_stderr"].values[ok] for name in ("stresses/dissipation_rate", "shear_stress")))
+    errors = np.hypot(
+        *(
+            data[f"{name}_stderr"].values[ok]
+            for name in ("stresses/dissipation_rate", "shear_stress")
+        )
+    )
     binary = data["stresses/binary_dissipation_rate"].values[ok] / dissipation
     return {
         "points": int(ok.sum()),
@@ -370,24 +466,40 @@ def root_chaos(points: Points) -> float:
 
 @styled
 def draw(points: Points, judged: Points, laws: CorrelationLaws) -> Figure:
-    """L′ against the packing fraction with its law, and predicted over measured pressure at flows of another map."""
+    """L′ against the packing fraction with its law, and predicted over measured pressure at flows
+    of another map.
+    """
     figure = Figure(figsize=(TWO_COLUMNS, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     dense = np.linspace(points["nu"].min(), points["nu"].max(), 200)
     for alpha, style in zip(DRAWN, curve_styles(len(DRAWN)), strict=True):
         some = only(points, points["alpha"] == alpha)
         look = {**style, "markersize": 4, "linestyle": "none", "label": rf"$\alpha$ = {alpha:g}"}
-        left.errorbar(some["nu"], some["length_from_pressure"], some["length_from_pressure_error"], **look)
+        left.errorbar(
+            some["nu"], some["length_from_pressure"], some["length_from_pressure_error"], **look
+        )
         law = np.asarray(correlation_length(laws, np.full_like(dense, alpha), dense))
         left.plot(dense, law, color=style["color"], linestyle="-", linewidth=1)
     none = replace(laws, length=np.zeros(3), pairs=np.zeros(3))
     for label, one, face in (("Enskog", none, "none"), ("corrected", laws, "0")):
         ratio = np.exp(misfits(one, judged)["pressure"])
         shift = 0.004 if face == "none" else -0.004
-        right.plot(judged["nu"] + shift, ratio, "o", color="0", markerfacecolor=face, markersize=4.5, label=label)
+        right.plot(
+            judged["nu"] + shift,
+            ratio,
+            "o",
+            color="0",
+            markerfacecolor=face,
+            markersize=4.5,
+            label=label,
+        )
     right.axhspan(0.9, 1.1, color="0.9", zorder=0, label=r"within 10 %")
-    left.set(yscale="log", xlabel=r"packing fraction $\nu$", ylabel=r"correlation length $L'/\sigma$")
-    right.set(yscale="log", xlabel=r"packing fraction $\nu$", ylabel="predicted / measured pressure")
+    left.set(
+        yscale="log", xlabel=r"packing fraction $\nu$", ylabel=r"correlation length $L'/\sigma$"
+    )
+    right.set(
+        yscale="log", xlabel=r"packing fraction $\nu$", ylabel="predicted / measured pressure"
+    )
     for axes, place in ((left, "upper left"), (right, "lower left")):
         axes.axhline(1, color="0.6", linewidth=0.8, zorder=0)
         axes.legend(fontsize=SMALL_SIZE, frameon=False, loc=place)

@@ -33,18 +33,26 @@ PICTURES: dict[str, Callable[[], Figure]] = {
         read("contact_duration")["event_driven"], read("contact_duration")["jaxgran"]
     ),
     "dissipation": lambda: dissipation.draw(
-        *(dissipation.of_rows(read("dissipation")[name]) for name in ("points", "judged_points")), MEASURED_LAWS
+        *(dissipation.of_rows(read("dissipation")[name]) for name in ("points", "judged_points")),
+        MEASURED_LAWS,
     ),
     "size_study": lambda: size_figures.draw_sizes(read("size_study")["flows"]),
     "size_study_waves": lambda: size_figures.draw_waves(read("size_study")["flows"]),
-    "enskog_factors": lambda: enskog_factors.draw(enskog_factors.FULL, read("enskog_factors")["rows"]),
+    "enskog_factors": lambda: enskog_factors.draw(
+        enskog_factors.FULL, read("enskog_factors")["rows"]
+    ),
     "gradients": lambda: gradients.draw(read("gradients")["flows"]),
     "scaling": lambda: scaling.draw(read("scaling"), read("scaling")["exponents"]),
     "speed_vs_accuracy": lambda: speed_vs_accuracy.draw(read("peers"), read("speed_vs_accuracy")),
     "stability": lambda: stability.draw(read("stability")["cells"]),
     "timestep_study": lambda: timestep_study.draw(read("timestep_study")["flows"]),
-    "validation": lambda: validation.draw(read("validation")["rows"], read("contact_duration")["reference"]),
-    **{f"paper_{name}": lambda draw=draw: draw(open_map(RESULTS / "paper.nc")) for name, draw in paper.FIGURES.items()},
+    "validation": lambda: validation.draw(
+        read("validation")["rows"], read("contact_duration")["reference"]
+    ),
+    **{
+        f"paper_{name}": lambda draw=draw: draw(open_map(RESULTS / "paper.nc"))
+        for name, draw in paper.FIGURES.items()
+    },
 }
 
 

@@ -1,10 +1,11 @@
-"""Which assumption of kinetic theory fails, against the time step and the number of grains: what survives the limits?
+"""Which assumption of kinetic theory fails, against the time step and the number of grains: what
+survives the limits?
 
-Five flows, midpoint rule. Contact stresses and dissipation rate over Enskog's are split into five factors, see
-``jaxgran.sampling.enskog_factors``. Against dt at N = 256, from 1e-2 to 1e-5: each seed reaches its steady state at
-dt = 1e-3; from there the coarser step is sampled, then the finer ones in turn, each after a strain of 0.5. Against
-N at dt = 1e-3, from 100 to 1600. A seed is sampled over a strain of 2√N, as the correlation strain of a flow grows
-with the side of its cell.
+Five flows, midpoint rule. Contact stresses and dissipation rate over Enskog's are split into five
+factors, see ``jaxgran.sampling.enskog_factors``. Against dt at N = 256, from 1e-2 to 1e-5: each
+seed reaches its steady state at dt = 1e-3; from there the coarser step is sampled, then the finer
+ones in turn, each after a strain of 0.5. Against N at dt = 1e-3, from 100 to 1600. A seed is
+sampled over a strain of 2√N, as the correlation strain of a flow grows with the side of its cell.
 
     python -m benchmarks enskog_factors           # about 3 minutes on two cores
     python -m benchmarks enskog_factors --quick   # two flows of 64 and 144 grains, half a minute
@@ -45,7 +46,9 @@ advance = jax.jit(jg.advance)
 
 
 class Plan(NamedTuple):
-    """Restitution and packing fraction of the flows, seeds, numbers of grains, and time steps at one of them."""
+    """Restitution and packing fraction of the flows, seeds, numbers of grains, and time steps at
+    one of them.
+    """
 
     flows: tuple[tuple[float, float], ...]
     seeds: int
@@ -72,8 +75,8 @@ def run(output: Output) -> None:
     with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
         done = dict(zip(tasks, pool.map(samples, [plan] * len(tasks), tasks), strict=True))
     print(
-        "   α    ν     N      dt  status          force ratio    T local   factors of the pressure: "
-        + ", ".join(FACTORS)
+        "   α    ν     N      dt  status          force ratio    T local   factors of the "
+        "pressure: " + ", ".join(FACTORS)
     )
     rows = []
     for flow, grains in product(plan.flows, plan.sizes):
@@ -88,14 +91,20 @@ def run(output: Output) -> None:
 
 def timesteps(plan: Plan, grains: int) -> tuple[float, ...]:
     """Time steps at a number of grains, the longest first."""
-    return tuple(sorted(plan.timesteps, reverse=True)) if grains == plan.size_of_timesteps else (START,)
+    return (
+        tuple(sorted(plan.timesteps, reverse=True))
+        if grains == plan.size_of_timesteps
+        else (START,)
+    )
 
 
 def samples(plan: Plan, task: tuple[int, tuple[float, float], int]) -> dict[float, jg.Sample]:
     """One seed of one flow and number of grains: a sample of every time step."""
     grains, (alpha, nu), seed = task
     strain = max(sqrt(grains), 2 / (nu * (1 - alpha**2)))
-    steady = state = jg.prepare(jg.ShearFlow(grains, alpha, nu, START), jax.random.key(seed), equilibrate=strain)
+    steady = state = jg.prepare(
+        jg.ShearFlow(grains, alpha, nu, START), jax.random.key(seed), equilibrate=strain
+    )
     found = {}
     for timestep in timesteps(plan, grains):
         flow = jg.ShearFlow(grains, alpha, nu, timestep)
@@ -109,7 +118,8 @@ def samples(plan: Plan, task: tuple[int, tuple[float, float], int]) -> dict[floa
 def row(flow: jg.ShearFlow, seeds: list[jg.Sample]) -> dict:
     """The factors of one flow with their standard errors, and what else is known of it."""
     value, error = (
-        found | more for found, more in zip(measured_over_enskog(flow, seeds), estimates(seeds), strict=True)
+        found | more
+        for found, more in zip(measured_over_enskog(flow, seeds), estimates(seeds), strict=True)
     )
     warm = value["local_granular_temperature"] / value["granular_temperature"]
     numbers = {"force_ratio": [value["force_ratio"], error["force_ratio"]]}
@@ -138,28 +148,43 @@ def line(one: dict) -> str:
 
 @styled
 def draw(plan: Plan, rows: list[dict]) -> Figure:
-    """The factors of the pressure: a row for each, against dt on the left and N on the right, a line for each flow."""
+    """The factors of the pressure: a row for each, against dt on the left and N on the right, a
+    line for each flow.
+    """
     figure = Figure(figsize=(TWO_COLUMNS, 8.2), layout="constrained")
     grid = figure.subplots(len(FACTORS), 2, sharex="col", sharey="row")
     sides = (("timestep", "grains", plan.size_of_timesteps), ("grains", "timestep", START))
     for panels, factor in zip(grid, FACTORS, strict=True):
         for axes, (x, fixed, at) in zip(panels, sides, strict=True):
             for flow, style in zip(plan.flows, curve_styles(len(plan.flows)), strict=True):
-                some = [one for one in rows if (one["alpha"], one["nu"]) == flow and one[fixed] == at]
+                some = [
+                    one for one in rows if (one["alpha"], one["nu"]) == flow and one[fixed] == at
+                ]
                 places = [one[x] for one in some]
                 value, error = np.array([one[f"pressure_{factor}"] for one in some]).T
                 label = f"α = {flow[0]:g}, ν = {flow[1]:g}"
-                axes.errorbar(places, value, error, **style, markersize=4, linewidth=1, capsize=2, label=label)
+                axes.errorbar(
+                    places, value, error, **style, markersize=4, linewidth=1, capsize=2, label=label
+                )
                 bad = np.array([one["status"] != "ok" for one in some])
                 if bad.any():
-                    axes.plot(np.array(places)[bad], value[bad], "o", markersize=9, fillstyle="none", color="0.3")
+                    axes.plot(
+                        np.array(places)[bad],
+                        value[bad],
+                        "o",
+                        markersize=9,
+                        fillstyle="none",
+                        color="0.3",
+                    )
             axes.axhline(1, color="0.6", linewidth=0.8, zorder=0)
             axes.set(xscale="log", yscale="log")
             axes.yaxis.set_major_formatter("{x:g}")
             axes.yaxis.set_minor_formatter("{x:g}")
             axes.tick_params(axis="y", which="minor", labelsize=7)
         panels[0].set_ylabel(TITLES[factor])
-    grid[-1, 0].set_xlabel(rf"time step $\dot\gamma\,\mathrm{{d}}t$, at $N$ = {plan.size_of_timesteps}")
+    grid[-1, 0].set_xlabel(
+        rf"time step $\dot\gamma\,\mathrm{{d}}t$, at $N$ = {plan.size_of_timesteps}"
+    )
     grid[-1, 1].set_xlabel(rf"number of grains $N$, at $\dot\gamma\,\mathrm{{d}}t$ = {START:g}")
     handles, _ = grid[0, 0].get_legend_handles_labels()
     ring = Line2D([], [], marker="o", markersize=9, fillstyle="none", color="0.3", linestyle="none")

@@ -1,9 +1,10 @@
-"""Exact solutions of the contact problem, each with a certificate: the reference of tests and benchmarks.
+"""Exact solutions of the contact problem, each with a certificate: the reference of tests and
+benchmarks.
 
-The problem is 0 ≤ p ⟂ w = W p + u⁻ ≥ 0 with W = G Gᵀ and G = H M^-½; see ``jaxgran.solver``. W is often singular. No
-method is trusted. Whatever a method returns is polished and then checked in extended precision; where the check fails,
-the next method is tried, and where all fail, an error is raised. So an answer cannot be wrong in silence, whatever the
-processor and its linear algebra.
+The problem is 0 ≤ p ⟂ w = W p + u⁻ ≥ 0 with W = G Gᵀ and G = H M^-½; see ``jaxgran.solver``. W is
+often singular. No method is trusted. Whatever a method returns is polished and then checked in
+extended precision; where the check fails, the next method is tried, and where all fail, an error is
+raised. So an answer cannot be wrong in silence, whatever the processor and its linear algebra.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +17,8 @@ from scipy.optimize import nnls
 from jaxgran.contact.network import Contacts
 
 EPS = float(np.finfo(float).eps)
-ROUNDINGS = 16  # of the largest term of w, that a residual may reach; the collection of networks needs less than one
+# Of the largest term of w, that a residual may reach; the collection needs less than one.
+ROUNDINGS = 16
 RESIDUAL, ENERGY, OBSTACLE = 1e-11, 1e-10, 1e-12  # largest relative errors of what is certified
 _POLISHING_STEPS, _INTERIOR_STEPS = 10, 100
 Method = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -68,7 +70,9 @@ def exact(contacts: Contacts, masses: np.ndarray) -> Exact:
 
 def incidence(contacts: Contacts, grains: int) -> np.ndarray:
     """H (contacts, 2 grains): relative normal velocities are H v. Rows of unused slots are zero."""
-    i, j, normals, used = (np.asarray(getattr(contacts, name)) for name in ("i", "j", "normals", "used"))
+    i, j, normals, used = (
+        np.asarray(getattr(contacts, name)) for name in ("i", "j", "normals", "used")
+    )
     matrix = np.zeros((len(i), grains, 2))
     rows = np.arange(len(i))
     np.add.at(matrix, (rows, i), normals)
@@ -78,22 +82,26 @@ def incidence(contacts: Contacts, grains: int) -> np.ndarray:
 
 
 def active_set(g: np.ndarray, approach: np.ndarray) -> np.ndarray:
-    """Multipliers q ≥ 0 from SciPy's non-negative least squares; they can be wrong, as it can end early.
+    """Multipliers q ≥ 0 from SciPy's non-negative least squares; they can be wrong, as it can end
+    early.
 
-    The velocity changes are the shortest vector x that satisfies G x ≥ −u⁻. Lawson and Hanson (Solving Least Squares
-    Problems, 1974, chapter 23) turn this into min ‖E q − e‖ over q ≥ 0 with the columns (G_c, −u⁻_c) in E and
-    e = (0, …, 0, 1). With r = 1 + u⁻·q, the impulses are q / r; where r = 0, there is no such x.
+    The velocity changes are the shortest vector x that satisfies G x ≥ −u⁻. Lawson and Hanson
+    (Solving Least Squares Problems, 1974, chapter 23) turn this into min ‖E q − e‖ over q ≥ 0 with
+    the columns (G_c, −u⁻_c) in E and e = (0, …, 0, 1). With r = 1 + u⁻·q, the impulses are q / r;
+    where r = 0, there is no such x.
     """
     unit = np.concatenate([np.zeros(g.shape[1]), [1.0]])
     return nnls(np.concatenate([g.T, -approach[None]]), unit, maxiter=100 * len(g))[0]
 
 
 def interior_point(g: np.ndarray, approach: np.ndarray) -> np.ndarray:
-    """The same multipliers from a primal-dual interior-point method, which never chooses a set of contacts.
+    """The same multipliers from a primal-dual interior-point method, which never chooses a set of
+    contacts.
 
-    Their conditions are 0 ≤ q ⟂ s = (G Gᵀ + u⁻u⁻ᵀ) q + u⁻ ≥ 0, a linear complementarity problem that always has a
-    solution. Steps of a predictor and a corrector after Mehrotra; Wright (Primal-Dual Interior-Point Methods, 1997),
-    chapters 8 and 10. Ends where q or s of each contact is at rounding, or where rounding stops the steps.
+    Their conditions are 0 ≤ q ⟂ s = (G Gᵀ + u⁻u⁻ᵀ) q + u⁻ ≥ 0, a linear complementarity problem
+    that always has a solution. Steps of a predictor and a corrector after Mehrotra; Wright
+    (Primal-Dual Interior-Point Methods, 1997), chapters 8 and 10. Ends where q or s of each contact
+    is at rounding, or where rounding stops the steps.
     """
     matrix = g @ g.T + np.outer(approach, approach)
     q, s = np.ones(len(g)), np.ones(len(g))
@@ -115,7 +123,9 @@ def interior_point(g: np.ndarray, approach: np.ndarray) -> np.ndarray:
     return q
 
 
-def _step(factor: tuple, q: np.ndarray, s: np.ndarray, missing: np.ndarray, target: np.ndarray) -> tuple:
+def _step(
+    factor: tuple, q: np.ndarray, s: np.ndarray, missing: np.ndarray, target: np.ndarray
+) -> tuple:
     """The Newton step of q and s to q s = target and to no missing part of s."""
     change = cho_solve(factor, (target - q * s) / q - missing)
     return change, (target - q * s - s * change) / q
@@ -130,17 +140,20 @@ def _reach(values: np.ndarray, changes: np.ndarray) -> float:
 METHODS: tuple[Method, ...] = (interior_point, active_set)
 
 
-def certified_impulses(g: np.ndarray, approach: np.ndarray, methods: Sequence[Method] = METHODS) -> np.ndarray | None:
+def certified_impulses(
+    g: np.ndarray, approach: np.ndarray, methods: Sequence[Method] = METHODS
+) -> np.ndarray | None:
     """Impulses p with 0 ≤ p ⟂ G Gᵀ p + u⁻ ≥ 0, to rounding.
 
     Args:
       g: (contacts, freedoms), G = H M^-½; no row may be zero.
       approach: (contacts,), u⁻.
-      methods: tried in turn. Each returns multipliers q for contacts whose rows of G have the length 1 and whose u⁻ has
-        the length 1 where it is negative; see ``active_set``.
+      methods: tried in turn. Each returns multipliers q for contacts whose rows of G have the
+        length 1 and whose u⁻ has the length 1 where it is negative; see ``active_set``.
 
     Returns:
-      Impulses for which ``is_solution`` holds; None where there are none, as shown by ``is_obstacle``.
+      Impulses for which ``is_solution`` holds; None where there are none, as shown by
+      ``is_obstacle``.
 
     Raises:
       ValueError: something is not finite, or a row is zero.
@@ -148,7 +161,10 @@ def certified_impulses(g: np.ndarray, approach: np.ndarray, methods: Sequence[Me
     """
     lengths = np.linalg.norm(g, axis=1)
     if not (np.all(np.isfinite(approach)) and np.all(np.isfinite(lengths)) and np.all(lengths > 0)):
-        raise ValueError("the contacts must have finite approach velocities and finite rows of G that are not zero")
+        raise ValueError(
+            "the contacts must have finite approach velocities and finite rows of G that are not "
+            "zero"
+        )
     if not np.any(approach < 0):
         return np.zeros(len(g))
     g = g[:, np.any(g != 0, axis=0)]  # without grains that have no contact
@@ -158,33 +174,42 @@ def certified_impulses(g: np.ndarray, approach: np.ndarray, methods: Sequence[Me
         try:
             q = np.maximum(method(rows, rates / unit), 0)
             left = 1 + q @ rates / unit
-            if left > 0 and is_solution(g, approach, p := _polished(g, approach, unit * q / left / lengths)):
+            if left > 0 and is_solution(
+                g, approach, p := _polished(g, approach, unit * q / left / lengths)
+            ):
                 return p
             if is_obstacle(g, approach, balanced(rows, q) / lengths):
                 return None
         except (LinAlgError, RuntimeError):  # a factorisation fails, or SciPy's iterations end
             continue
-    raise ArithmeticError(f"no exact solution of {len(g)} contacts: none of {len(methods)} methods passed the check")
+    raise ArithmeticError(
+        f"no exact solution of {len(g)} contacts: none of {len(methods)} methods passed the check"
+    )
 
 
 def natural_residual(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> float:
-    """‖min(diag(W) p, W p + u⁻)‖ over ‖min(u⁻, 0)‖, in extended precision; zero where nothing approaches or pushes."""
+    """‖min(diag(W) p, W p + u⁻)‖ over ‖min(u⁻, 0)‖, in extended precision; zero where nothing
+    approaches or pushes.
+    """
     least = np.minimum(np.sum(g**2, axis=1) * impulses, _after(g, approach, impulses))
     scale = np.linalg.norm(np.minimum(approach, 0))
     return float(np.linalg.norm(least) / scale) if scale > 0 else float(np.linalg.norm(least))
 
 
 def is_solution(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> bool:
-    """Whether impulses solve the contact problem to rounding: the certificate, in extended precision.
+    """Whether impulses solve the contact problem to rounding: the certificate, in extended
+    precision.
 
     No impulse may be negative, and three errors must be small:
 
-    - max |min(diag(W) p, w)|, at most ``ROUNDINGS`` ε of the largest |G| |Gᵀ| p + |u⁻|, the terms that w is the sum of.
-      As min(diag(W) p, w) ≤ w, no contact approaches faster than that after;
-    - the natural residual, at most ``RESIDUAL``, as impulses that are huge and cancel hide an approach in rounding;
-    - a bound of the kinetic energy of the error of the velocity changes, at most ``ENERGY`` of that of the changes. For
-      exact p₀ and w₀, (p − p₀)ᵀ W (p − p₀) = (p − p₀)·(w − w₀) ≤ p·w − p₀·w ≤ Σ p |w| + Σ p₀ max(−w), where Σ p stands
-      for the unknown Σ p₀. Rounding of p alone makes it ε Σ p |w|, at a mass ratio of 10⁴ some 10⁻¹¹.
+    - max |min(diag(W) p, w)|, at most ``ROUNDINGS`` ε of the largest |G| |Gᵀ| p + |u⁻|, the terms
+      that w is the sum of. As min(diag(W) p, w) ≤ w, no contact approaches faster than that after;
+    - the natural residual, at most ``RESIDUAL``, as impulses that are huge and cancel hide an
+      approach in rounding;
+    - a bound of the kinetic energy of the error of the velocity changes, at most ``ENERGY`` of that
+      of the changes. For exact p₀ and w₀, (p − p₀)ᵀ W (p − p₀) = (p − p₀)·(w − w₀) ≤ p·w − p₀·w ≤ Σ
+      p |w| + Σ p₀ max(−w), where Σ p stands for the unknown Σ p₀. Rounding of p alone makes it ε Σ
+      p |w|, at a mass ratio of 10⁴ some 10⁻¹¹.
     """
     if not (np.all(np.isfinite(impulses)) and np.all(impulses >= 0)):
         return False
@@ -201,26 +226,32 @@ def is_solution(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> bo
 
 
 def is_obstacle(g: np.ndarray, approach: np.ndarray, weights: np.ndarray) -> bool:
-    """Whether weights q ≥ 0 show that no velocities satisfy all contacts (Farkas): Gᵀ q = 0 and q·u⁻ < 0, to rounding.
+    """Whether weights q ≥ 0 show that no velocities satisfy all contacts (Farkas): Gᵀ q = 0 and
+    q·u⁻ < 0, to rounding.
 
-    Changes x with G x ≥ −u⁻ have (Gᵀq)·x ≥ −q·u⁻, so ‖x‖ ≥ −q·u⁻ / ‖Gᵀq‖. Here that is more than 1 / ``OBSTACLE``
-    times what stops the approach of the contacts one by one.
+    Changes x with G x ≥ −u⁻ have (Gᵀq)·x ≥ −q·u⁻, so ‖x‖ ≥ −q·u⁻ / ‖Gᵀq‖. Here that is more than 1
+    / ``OBSTACLE`` times what stops the approach of the contacts one by one.
     """
     if not (np.all(np.isfinite(weights)) and np.all(weights >= 0)):
         return False
     singly = np.linalg.norm(np.minimum(approach, 0) / np.linalg.norm(g, axis=1))
-    return bool(-weights @ approach * OBSTACLE > np.linalg.norm(weights @ g.astype(np.longdouble)) * singly)
+    return bool(
+        -weights @ approach * OBSTACLE > np.linalg.norm(weights @ g.astype(np.longdouble)) * singly
+    )
 
 
 def _after(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> np.ndarray:
-    """w = G Gᵀ p + u⁻ in the longest numbers that NumPy has; it adds them without the processor's linear algebra."""
+    """w = G Gᵀ p + u⁻ in the longest numbers that NumPy has; it adds them without the processor's
+    linear algebra.
+    """
     wide = g.astype(np.longdouble)
     return wide @ (impulses.astype(np.longdouble) @ wide) + approach
 
 
 def _polished(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> np.ndarray:
-    """The best of the impulses and of those after Newton steps on the natural residual (Facchinei and Pang,
-    Finite-Dimensional Variational Inequalities, 2003, chapter 9), whose right-hand side is in extended precision."""
+    """The best of the impulses and of those after Newton steps on the natural residual (Facchinei
+    and Pang, Finite-Dimensional Variational Inequalities, 2003, chapter 9), whose right-hand side
+    is in extended precision."""
     own = np.sum(g**2, axis=1)
     best, least = impulses, natural_residual(g, approach, impulses)
     for _ in range(_POLISHING_STEPS):
@@ -230,7 +261,9 @@ def _polished(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> np.n
         kept = lengths > 1e-10 * np.max(lengths, initial=0)
         left = left[:, kept]
         better = np.zeros_like(impulses)
-        better[push] = impulses[push] - left @ ((left.T @ after[push].astype(float)) / lengths[kept] ** 2)
+        better[push] = impulses[push] - left @ (
+            (left.T @ after[push].astype(float)) / lengths[kept] ** 2
+        )
         impulses = better
         residual = natural_residual(g, approach, np.maximum(impulses, 0))
         if residual < least:

@@ -1,8 +1,8 @@
 """Picture of two flows of one packing fraction: grains that bounce, and grains that hardly do.
 
-Both flows are sheared to their steady state and on to the same tilt of the cell. Of the next steps every one is a
-snapshot, and a line shows the mean force between two grains over that short time: at α = 0.9 pairs collide one after
-the other, at α = 0.1 chains of grains push at once.
+Both flows are sheared to their steady state and on to the same tilt of the cell. Of the next steps
+every one is a snapshot, and a line shows the mean force between two grains over that short time: at
+α = 0.9 pairs collide one after the other, at α = 0.1 chains of grains push at once.
 
 A movie shows a third flow, by the command that the README gives.
 
@@ -23,12 +23,23 @@ from benchmarks.output import Output
 from jaxgran.analysis.force_chains import cluster_share, clusters
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.plotting.drawing import TWO_COLUMNS, styled
-from jaxgran.plotting.flow import COLOUR_LABELS, Colour, Scene, common_scale, draw_scene, force_key, scene_of
+from jaxgran.plotting.flow import (
+    COLOUR_LABELS,
+    Colour,
+    Scene,
+    common_scale,
+    draw_scene,
+    force_key,
+    scene_of,
+)
 
 RESTITUTIONS, PACKING_FRACTION = (0.9, 0.1), 0.8
 THINNER = 0.6  # lines of the figure, over those of a flow that fills a page
 TILT = 0.15  # of the cell at the first snapshot
-MOVIE = "run --restitution 0.3 --packing-fraction 0.78 --grains 100 --strain 0.5 --frame-strain 0.02 --movie"
+MOVIE = (
+    "run --restitution 0.3 --packing-fraction 0.78 --grains 100 --strain 0.5 --frame-strain "
+    "0.02 --movie"
+)
 
 
 class Choice(NamedTuple):
@@ -46,13 +57,18 @@ def run(output: Output, colour: Colour = "speed") -> None:
     choice = QUICK if output.quick else FULL
     flows = [window(restitution, choice) for restitution in RESTITUTIONS]
 
-    rows = [summary(restitution, snapshots) for restitution, snapshots in zip(RESTITUTIONS, flows, strict=True)]
+    rows = [
+        summary(restitution, snapshots)
+        for restitution, snapshots in zip(RESTITUTIONS, flows, strict=True)
+    ]
     for row in rows:
         print(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
     output.write_json("flow", {"nu": PACKING_FRACTION, **choice._asdict(), "flows": rows})
     output.write_picture(draw([scene_of(snapshots) for snapshots in flows], colour), "flow")
     movie = str(output.path("flow", ".gif"))
-    subprocess.run([sys.executable, "-m", "jaxgran", *MOVIE.split(), movie, "--overwrite"], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "jaxgran", *MOVIE.split(), movie, "--overwrite"], check=True
+    )
 
 
 def window(restitution: float, choice: Choice) -> Snapshot:
@@ -90,6 +106,13 @@ def draw(scenes: list[Scene], colour: Colour) -> Figure:
             lines.set_linewidth(THINNER * np.array(lines.get_linewidth()))
         *handles, widest = force_key(scale)
         artists.title.set_text(rf"({letter}) $\alpha={scene.restitution:g}$; {widest.get_label()}")
-        figure.colorbar(artists.grains, ax=axes, label=COLOUR_LABELS[colour], extend="max", shrink=0.75, pad=0.01)
+        figure.colorbar(
+            artists.grains,
+            ax=axes,
+            label=COLOUR_LABELS[colour],
+            extend="max",
+            shrink=0.75,
+            pad=0.01,
+        )
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return figure

@@ -21,8 +21,9 @@ def gauss_seidel(
 ) -> Solution:
     """Impulses by projected Gauss–Seidel sweeps over the contacts in their order.
 
-    The residual and the tolerance are those of ``jaxgran.contact.solver.solve``. The updates of a sweep estimate the
-    residual for nothing; it is computed only when that estimate has met the tolerance, and then decides.
+    The residual and the tolerance are those of ``jaxgran.contact.solver.solve``. The updates of a
+    sweep estimate the residual for nothing; it is computed only when that estimate has met the
+    tolerance, and then decides.
 
     Args:
       contacts: the network.
@@ -32,9 +33,12 @@ def gauss_seidel(
       shear_rate: γ̇; sets the absolute floor of the residual.
 
     Returns:
-      The solution, of NumPy arrays; ``iterations`` counts the sweeps, each of the cost of one product with W.
+      The solution, of NumPy arrays; ``iterations`` counts the sweeps, each of the cost of one
+      product with W.
     """
-    i, j, normals, _, approach, inverse_i, inverse_j, used = (np.asarray(values) for values in vars(contacts).values())
+    i, j, normals, _, approach, inverse_i, inverse_j, used = (
+        np.asarray(values) for values in vars(contacts).values()
+    )
     kind, eps = normals.dtype.type, np.finfo(normals.dtype).eps
     scale = np.linalg.norm(np.minimum(approach, 0))
     target = kind(tolerance * scale + 10 * eps * shear_rate)
@@ -46,12 +50,17 @@ def gauss_seidel(
     status = Status.ok if residual <= target else Status.iteration_limit
     status = status if np.isfinite(residual) else Status.nonfinite
     response = np.sum(normals * (kicks[i] - kicks[j]), axis=1)
-    return Solution(impulses, response, residual / max(scale, target), np.int32(sweeps), np.int32(status))
+    return Solution(
+        impulses, response, residual / max(scale, target), np.int32(sweeps), np.int32(status)
+    )
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _sweep(i, j, normals, inverse_i, inverse_j, approach, impulses, kicks, count, target, max_sweeps):
-    """Sweeps until the square of the residual meets ``target``; impulses and velocity changes are updated in place.
+def _sweep(
+    i, j, normals, inverse_i, inverse_j, approach, impulses, kicks, count, target, max_sweeps
+):
+    """Sweeps until the square of the residual meets ``target``; impulses and velocity changes are
+    updated in place.
 
     Returns:
       The sweeps done and the residual.
@@ -64,7 +73,9 @@ def _sweep(i, j, normals, inverse_i, inverse_j, approach, impulses, kicks, count
             a, b = i[c], j[c]
             nx, ny = normals[c, 0], normals[c, 1]
             own = inverse_i[c] + inverse_j[c]
-            after = nx * (kicks[a, 0] - kicks[b, 0]) + ny * (kicks[a, 1] - kicks[b, 1]) + approach[c]
+            after = (
+                nx * (kicks[a, 0] - kicks[b, 0]) + ny * (kicks[a, 1] - kicks[b, 1]) + approach[c]
+            )
             change = max(-after / own, -impulses[c])
             impulses[c] += change
             kicks[a, 0] += change * inverse_i[c] * nx

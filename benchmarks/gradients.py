@@ -3,9 +3,9 @@
     python -m benchmarks gradients           # both parts
     python -m benchmarks gradients --quick   # one flow, fewer runs
 
-The first part times an advance of 100 steps and its derivatives, on one core, and counts the memory of the gradient of
-1000 steps. The second follows ∂(state)/∂α with and without contacts that move in time, beside the difference of two
-neighbouring runs, and fits the exponent of its growth.
+The first part times an advance of 100 steps and its derivatives, on one core, and counts the memory
+of the gradient of 1000 steps. The second follows ∂(state)/∂α with and without contacts that move in
+time, beside the difference of two neighbouring runs, and fits the exponent of its growth.
 """
 
 import time
@@ -29,7 +29,11 @@ DIFFERENCE = 1e-4  # between the restitutions of two neighbouring runs
 HORIZON = 100.0  # |∂(state)/∂α| at which a change of α by 0.01 moves the grains by a diameter
 SOLVER = jg.BarzilaiBorwein(tolerance=1e-9, max_steps=20_000)
 STEPS, MANY_STEPS, REPEATS = 100, 1000, 15
-COSTS = ((64, 0.6, 0.7), (256, 0.6, 0.7), (64, 0.3, 0.75))  # grains, restitution, packing fraction; dt = 1e-3
+COSTS = (
+    (64, 0.6, 0.7),
+    (256, 0.6, 0.7),
+    (64, 0.3, 0.75),
+)  # grains, restitution, packing fraction; dt = 1e-3
 
 
 def prepared(grains: int, alpha: float, nu: float, timestep: float, seed: int = 0):
@@ -39,7 +43,9 @@ def prepared(grains: int, alpha: float, nu: float, timestep: float, seed: int = 
 
 
 def cost(grains: int, alpha: float, nu: float) -> dict:
-    """Median seconds of an advance and of its derivatives in turn, and bytes of the gradient of a long one."""
+    """Median seconds of an advance and of its derivatives in turn, and bytes of the gradient of a
+    long one.
+    """
     flow, state = prepared(grains, alpha, nu, 1e-3)
     events = int(jax.jit(partial(jg.count_events, solver=SOLVER))(flow, state, jnp.int32(STEPS)))
 
@@ -63,7 +69,12 @@ def cost(grains: int, alpha: float, nu: float) -> dict:
     for _ in range(REPEATS):
         for name, route in routes.items():
             times[name].append(elapsed(route, *at))
-    long = jax.jit(lambda *x: gradient(*x, MANY_STEPS + 1, MANY_STEPS)).lower(*at).compile().memory_analysis()
+    long = (
+        jax.jit(lambda *x: gradient(*x, MANY_STEPS + 1, MANY_STEPS))
+        .lower(*at)
+        .compile()
+        .memory_analysis()
+    )
     return {
         "grains": grains,
         "restitution": alpha,
@@ -83,7 +94,9 @@ def elapsed(function, *arguments) -> float:
 
 
 def followed(alpha: float, nu: float, runs: int) -> dict:
-    """Growth of the derivatives of a flow and of the difference of two runs, (runs, points) each."""
+    """Growth of the derivatives of a flow and of the difference of two runs, (runs, points)
+    each.
+    """
     rows = {"moving": [], "fixed": [], "difference": []}
     for seed in range(runs):
         flow, state = prepared(GRAINS, alpha, nu, TIMESTEP, seed)
@@ -91,7 +104,11 @@ def followed(alpha: float, nu: float, runs: int) -> dict:
             rows[name].append(np.asarray(growth(flow, state, moving)).tolist())
         rows["difference"].append(np.asarray(differences(flow, state)).tolist())
     strain = STRAIN / POINTS * np.arange(1, POINTS + 1)
-    exponents = {name: exponent(strain, np.array(values)) for name, values in rows.items() if name != "difference"}
+    exponents = {
+        name: exponent(strain, np.array(values))
+        for name, values in rows.items()
+        if name != "difference"
+    }
     typical = np.exp(np.mean(np.log(rows["moving"]), axis=0))
     beyond = np.flatnonzero(typical > HORIZON)
     return {
@@ -105,9 +122,11 @@ def followed(alpha: float, nu: float, runs: int) -> dict:
 
 
 def exponent(strain: np.ndarray, derivative: np.ndarray) -> list[float]:
-    """The rate λ of |∂(state)/∂α| ∝ exp(λ γ) and its standard error over runs; none of a single run.
+    """The rate λ of |∂(state)/∂α| ∝ exp(λ γ) and its standard error over runs; none of a single
+    run.
 
-    The rate of a run is the slope over the last three quarters of its strain, since the derivative starts from zero.
+    The rate of a run is the slope over the last three quarters of its strain, since the derivative
+    starts from zero.
     """
     later = strain >= strain[-1] / 4
     slopes = np.polyfit(strain[later], np.log(derivative[:, later]).T, 1)[0]
@@ -116,14 +135,18 @@ def exponent(strain: np.ndarray, derivative: np.ndarray) -> list[float]:
 
 @partial(jax.jit, static_argnames="moving_contacts")
 def growth(flow, state, moving_contacts: bool):
-    """Root mean square over the grains of |∂(position, velocity)/∂α|, at the points of the growth."""
+    """Root mean square over the grains of |∂(position, velocity)/∂α|, at the points of the
+    growth.
+    """
     steps = jnp.int32(round(STRAIN / POINTS / TIMESTEP))
 
     def part(carry, _):
         def end(alpha, positions, velocities, tilt):
             start = replace(carry[0], positions=positions, velocities=velocities, tilt=tilt)
             changed = replace(flow, restitution=alpha)
-            later, _ = jg.advance(changed, start, steps, moving_contacts=moving_contacts, solver=SOLVER)
+            later, _ = jg.advance(
+                changed, start, steps, moving_contacts=moving_contacts, solver=SOLVER
+            )
             return later.positions, later.velocities, later.tilt
 
         now, change = carry
@@ -138,14 +161,19 @@ def growth(flow, state, moving_contacts: bool):
 
 @jax.jit
 def differences(flow, state):
-    """Distance of two runs whose restitutions differ, over the difference, at the points of the growth."""
+    """Distance of two runs whose restitutions differ, over the difference, at the points of the
+    growth.
+    """
     steps = jnp.int32(round(STRAIN / POINTS / TIMESTEP))
 
     def part(states, _):
         pair = [
-            jg.advance(replace(flow, restitution=flow.restitution + sign * DIFFERENCE / 2), each, steps, solver=SOLVER)[
-                0
-            ]
+            jg.advance(
+                replace(flow, restitution=flow.restitution + sign * DIFFERENCE / 2),
+                each,
+                steps,
+                solver=SOLVER,
+            )[0]
             for sign, each in zip((1, -1), states, strict=True)
         ]
         moved = displacement(pair[0].positions, pair[1].positions, pair[0].side, pair[0].tilt)
@@ -157,23 +185,46 @@ def differences(flow, state):
 
 @styled
 def draw(flows: list[dict]) -> Figure:
-    """Growth in the flows that are drawn: geometric means over the runs, with the scatter of one as a band."""
+    """Growth in the flows that are drawn: geometric means over the runs, with the scatter of one as
+    a band.
+    """
     figure = Figure(figsize=(TWO_COLUMNS, 2.4), layout="constrained")
     drawn = [flow for flow in flows if (flow["restitution"], flow["packing_fraction"]) in DRAWN]
-    for axes, flow in zip(figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0], drawn, strict=True):
+    for axes, flow in zip(
+        figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0], drawn, strict=True
+    ):
         strain = np.array(flow["strain"])
         logs = {name: np.log(np.array(flow[name])) for name in ("moving", "fixed", "difference")}
         middle, spread = logs["moving"].mean(0), logs["moving"].std(0)
-        axes.fill_between(strain, np.exp(middle - spread), np.exp(middle + spread), color="0.87", lw=0)
-        axes.plot(strain, np.exp(middle), "-", color="black", label="derivative, contacts move in time")
-        axes.plot(strain, np.exp(logs["fixed"].mean(0)), "--", color="0.4", label="derivative at fixed steps")
+        axes.fill_between(
+            strain, np.exp(middle - spread), np.exp(middle + spread), color="0.87", lw=0
+        )
+        axes.plot(
+            strain, np.exp(middle), "-", color="black", label="derivative, contacts move in time"
+        )
+        axes.plot(
+            strain,
+            np.exp(logs["fixed"].mean(0)),
+            "--",
+            color="0.4",
+            label="derivative at fixed steps",
+        )
         exponent = f"10^{{{round(np.log10(DIFFERENCE))}}}"
         label = rf"two runs, $\delta\alpha={exponent}$"
-        axes.plot(strain[::3], np.exp(logs["difference"].mean(0))[::3], "o", mfc="none", color="black", label=label)
+        axes.plot(
+            strain[::3],
+            np.exp(logs["difference"].mean(0))[::3],
+            "o",
+            mfc="none",
+            color="black",
+            label=label,
+        )
         axes.axhline(HORIZON, color="0.6", lw=0.8, ls=":")
         axes.set_title(rf"$\alpha={flow['restitution']:g}$, $\nu={flow['packing_fraction']:g}$")
         axes.set(yscale="log", xlabel=r"strain $\dot\gamma t$", xlim=(0, strain[-1]))
-    figure.axes[0].set_ylabel(r"$|\partial(\mathrm{state})/\partial\alpha|$ of a grain ($\sigma$, $\sigma\dot\gamma$)")
+    figure.axes[0].set_ylabel(
+        r"$|\partial(\mathrm{state})/\partial\alpha|$ of a grain ($\sigma$, $\sigma\dot\gamma$)"
+    )
     figure.axes[0].legend(loc="upper left")
     return figure
 
@@ -185,11 +236,21 @@ def run(output: Output) -> None:
     for grains, alpha, nu in costs:
         result["costs"].append(cost(grains, alpha, nu))
         row = result["costs"][-1]
-        print({name: f"{1e3 * value:.2f} ms" for name, value in row["median_seconds"].items()}, flush=True)
-        print(f"gradient of {MANY_STEPS} steps: {row['gradient_of_1000_steps_bytes'] / 2**20:.0f} MiB", flush=True)
+        print(
+            {name: f"{1e3 * value:.2f} ms" for name, value in row["median_seconds"].items()},
+            flush=True,
+        )
+        print(
+            f"gradient of {MANY_STEPS} steps: "
+            f"{row['gradient_of_1000_steps_bytes'] / 2**20:.0f} MiB",
+            flush=True,
+        )
     for alpha, nu in flows:
         result["flows"].append(followed(alpha, nu, runs))
         row = result["flows"][-1]
-        print(f"({alpha}, {nu}): exponents {row['exponents']}, horizon {row['horizon_strain']}", flush=True)
+        print(
+            f"({alpha}, {nu}): exponents {row['exponents']}, horizon {row['horizon_strain']}",
+            flush=True,
+        )
     output.write_json("gradients", result)
     output.write_picture(draw(result["flows"]), "gradients")

@@ -1,8 +1,9 @@
-"""What each way to advance many replicas costs: compilation, processor time of a replica and step, memory.
+"""What each way to advance many replicas costs: compilation, processor time of a replica and step,
+memory.
 
-Sixteen replicas of 64 grains are advanced by 200 steps of dt = 1e-3, at three points, by each way and engine;
-and the gradient of a mean over the replicas is taken through 20 steps. Times are those of the processor, so that other
-work on the machine counts little.
+Sixteen replicas of 64 grains are advanced by 200 steps of dt = 1e-3, at three points, by each way
+and engine; and the gradient of a mean over the replicas is taken through 20 steps. Times are those
+of the processor, so that other work on the machine counts little.
 
     python -m benchmarks many_replicas            # 2 minutes
     python -m benchmarks many_replicas --quick    # two replicas, one point, no gradient: 1 minute
@@ -56,7 +57,14 @@ def run(output: Output) -> None:
         rows.append(gradient(starts[0]))
     output.write_json(
         "many_replicas",
-        {"grains": GRAINS, "timestep": TIMESTEP, "replicas": replicas, "steps": STEPS, "points": points, "ways": rows},
+        {
+            "grains": GRAINS,
+            "timestep": TIMESTEP,
+            "replicas": replicas,
+            "steps": STEPS,
+            "points": points,
+            "ways": rows,
+        },
     )
 
 
@@ -81,11 +89,24 @@ def measured(name: str, way, starts: list, points: tuple, replicas: int) -> dict
     microseconds = []
     for flows, states in starts:
         jax.block_until_ready(program(flows, states, steps))
-        run_seconds, _ = timed(lambda f=flows, s=states: jax.block_until_ready(program(f, s, steps)))
+        run_seconds, _ = timed(
+            lambda f=flows, s=states: jax.block_until_ready(program(f, s, steps))
+        )
         microseconds.append(run_seconds / (replicas * STEPS) * 1e6)
-    texts = " ".join(f"({alpha}, {nu}): {us:.2f} µs" for (alpha, nu), us in zip(points, microseconds, strict=True))
-    print(f"{name:32} compile {seconds:5.1f} s  {memory / replicas:6.2f} MiB a replica  {texts}", flush=True)
-    return {"way": name, "compile_seconds": seconds, "mib_per_replica": memory / replicas, "us": microseconds}
+    texts = " ".join(
+        f"({alpha}, {nu}): {us:.2f} µs"
+        for (alpha, nu), us in zip(points, microseconds, strict=True)
+    )
+    print(
+        f"{name:32} compile {seconds:5.1f} s  {memory / replicas:6.2f} MiB a replica  {texts}",
+        flush=True,
+    )
+    return {
+        "way": name,
+        "compile_seconds": seconds,
+        "mib_per_replica": memory / replicas,
+        "us": microseconds,
+    }
 
 
 def gradient(start: tuple[jg.ShearFlow, jg.State]) -> dict:
@@ -104,7 +125,10 @@ def gradient(start: tuple[jg.ShearFlow, jg.State]) -> dict:
     run_seconds, _ = timed(lambda: jax.block_until_ready(program(flows.restitution)))
     replicas = len(flows.restitution)
     us = run_seconds / (replicas * GRADIENT_STEPS) * 1e6
-    print(f"gradient, {events} events: compile {seconds:.1f} s, {memory / replicas:.2f} MiB a replica, {us:.1f} µs")
+    print(
+        f"gradient, {events} events: compile {seconds:.1f} s, {memory / replicas:.2f} MiB a "
+        f"replica, {us:.1f} µs"
+    )
     return {
         "way": "gradient",
         "events": events,

@@ -1,4 +1,6 @@
-"""Where a benchmark writes: JSON with what it was measured with, pictures beside it, and a tree without changes."""
+"""Where a benchmark writes: JSON with what it was measured with, pictures beside it, and a tree
+without changes.
+"""
 
 import json
 import os
@@ -20,7 +22,9 @@ PACKAGES = ("jaxgran", "jax", "jaxlib", "numpy", "numba")
 
 
 def uncommitted() -> list[str]:
-    """Files of the checkout that differ from its commit, other than results; none where this is no checkout."""
+    """Files of the checkout that differ from its commit, other than results; none where this is no
+    checkout.
+    """
     if not (ROOT / ".git").exists():
         return []
     command = ["git", "status", "--porcelain", "--", ".", ":(exclude)benchmarks/results"]
@@ -38,13 +42,16 @@ def rounded(value: Any, digits: int) -> Any:
 
 
 def refusal() -> str | None:
-    """Why a full run would write results that no commit stands for, and what to do; None where it would not."""
+    """Why a full run would write results that no commit stands for, and what to do; None where it
+    would not.
+    """
     changed = uncommitted()
     if not changed:
         return None
     others = f" and {len(changed) - 1} more" if changed[1:] else ""
     return (
-        f"the tree has uncommitted changes ({changed[0]}{others}): commit them, or add --quick or --allow-uncommitted."
+        f"the tree has uncommitted changes ({changed[0]}{others}): commit them, or add --quick "
+        "or --allow-uncommitted."
     )
 
 
@@ -63,9 +70,11 @@ def hardware() -> dict[str, str | int]:
 
 @dataclass(frozen=True)
 class Output:
-    """The folder of the results of one run, and what they are measured with, as it was when the run began.
+    """The folder of the results of one run, and what they are measured with, as it was when the run
+    began.
 
-    The names of the files of a quick run contain ``_quick``, so that they are never taken for results.
+    The names of the files of a quick run contain ``_quick``, so that they are never taken for
+    results.
     """
 
     folder: Path
@@ -73,7 +82,9 @@ class Output:
     hardware: dict[str, str | int] = field(default_factory=hardware)
 
     def path(self, name: str, ending: str) -> Path:
-        """The file of a name and an ending, such as ``stability`` and ``_variants.png``; its folder exists."""
+        """The file of a name and an ending, such as ``stability`` and ``_variants.png``; its folder
+        exists.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         return self.folder / f"{name}{'_quick' if self.quick else ''}{ending}"
 
@@ -82,15 +93,24 @@ class Output:
         text = json.dumps({"hardware": self.hardware, **content}, indent=1)
         self.path(name, ".json").write_text(text + "\n")
 
-    def write_rows(self, name: str, head: Mapping[str, Any], key: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    def write_rows(
+        self, name: str, head: Mapping[str, Any], key: str, rows: Sequence[Mapping[str, Any]]
+    ) -> None:
         """Write a result with many rows, one to a line; what is not a number is null."""
         start = json.dumps({"hardware": self.hardware, **head}, indent=1, ensure_ascii=False)
         lines = ",\n".join(
-            "  " + json.dumps({k: None if v != v else v for k, v in row.items()}, ensure_ascii=False, allow_nan=False)
+            "  "
+            + json.dumps(
+                {k: None if v != v else v for k, v in row.items()},
+                ensure_ascii=False,
+                allow_nan=False,
+            )
             for row in rows
         )
         self.path(name, ".json").write_text(start[:-2] + f',\n "{key}": [\n{lines}\n ]\n}}\n')
 
-    def write_picture(self, figure: Figure, name: str, ending: str = ".png", dpi: int = FILE_DPI) -> None:
+    def write_picture(
+        self, figure: Figure, name: str, ending: str = ".png", dpi: int = FILE_DPI
+    ) -> None:
         """Write a figure as PNG."""
         write(figure, self.path(name, ending), dpi, caption=False)

@@ -1,10 +1,12 @@
 """Measured numbers of a page, filled in from ``benchmarks/results`` when the site is built.
 
-A page is a Jinja template. ``{{ pm(row.value, row.error) }}`` stands for a value with its standard error, and a loop
-over the rows of a result makes a table, so that neither can differ from the file. A name that a file does not have
-stops the build. Markdown needs braces for itself: comments of Jinja are ``{=# … #=}``.
+A page is a Jinja template. ``{{ pm(row.value, row.error) }}`` stands for a value with its standard
+error, and a loop over the rows of a result makes a table, so that neither can differ from the file.
+A name that a file does not have stops the build. Markdown needs braces for itself: comments of
+Jinja are ``{=# … #=}``.
 
-The README and the paper are filled in from ``docs/_build`` and committed, since they are read where no site is built:
+The README and the paper are filled in from ``docs/_build`` and committed, since they are read where
+no site is built:
 
     python -m benchmarks.pages
 """
@@ -31,7 +33,10 @@ from jaxgran.model.display import with_error
 from jaxgran.reference.table import FACTORS
 from jaxgran.sampling.budget import fewest_grains
 
-TEMPLATES = {"README.md": "docs/_build/README.md", "docs/paper/paper.md": "docs/_build/paper.md"}  # of committed pages
+TEMPLATES = {
+    "README.md": "docs/_build/README.md",
+    "docs/paper/paper.md": "docs/_build/paper.md",
+}  # of committed pages
 
 
 class Results:
@@ -59,7 +64,9 @@ def at(rows: Iterable[Mapping[str, Any]], **conditions: Any) -> Mapping[str, Any
 
 def found(rows: Iterable[Mapping[str, Any]], **conditions: Any) -> Mapping[str, Any] | None:
     """The first row with these values, None if there is none."""
-    return next((row for row in rows if all(row[name] == value for name, value in conditions.items())), None)
+    return next(
+        (row for row in rows if all(row[name] == value for name, value in conditions.items())), None
+    )
 
 
 def flows_of(rows: Iterable[Mapping[str, Any]]) -> list[tuple[float, float]]:
@@ -68,7 +75,8 @@ def flows_of(rows: Iterable[Mapping[str, Any]]) -> list[tuple[float, float]]:
 
 
 def sig(value: float, digits: int = 2) -> str:
-    """A number rounded to some significant digits, with commas between thousands and without an exponent above 1e-4.
+    """A number rounded to some significant digits, with commas between thousands and without an
+    exponent above 1e-4.
 
     Examples:
       >>> sig(0.12346), sig(1234.5, 3), sig(99999), sig(3.2e-7), sig(1.0, 3)
@@ -119,7 +127,9 @@ def _map(file: str) -> Any:
 
 
 def point(file: str, name: str, restitution: float, packing_fraction: float) -> tuple[float, float]:
-    """A variable of a map at a point, and its standard error; 0 for a prediction, which has none."""
+    """A variable of a map at a point, and its standard error; 0 for a prediction, which has
+    none.
+    """
     group, _, variable = name.rpartition("/")
     data = _map(file)[group] if group else _map(file)
     chosen = {"restitution": restitution, "packing_fraction": packing_fraction}
@@ -127,7 +137,9 @@ def point(file: str, name: str, restitution: float, packing_fraction: float) -> 
     return float(data[variable].sel(chosen)), error
 
 
-def shear_stress_ratio_at(file: str, restitution: float, packing_fraction: float) -> tuple[float, float]:
+def shear_stress_ratio_at(
+    file: str, restitution: float, packing_fraction: float
+) -> tuple[float, float]:
     """Contact shear stress over the binary one at a point of a map, and its standard error."""
     chosen = {"restitution": restitution, "packing_fraction": packing_fraction}
     value, error = (float(one.sel(chosen)) for one in shear_stress_ratio(_map(file)))
@@ -155,7 +167,8 @@ def signed(value: float, places: int = 1) -> str:
 
 
 def over(one: Sequence[float], other: Sequence[float]) -> tuple[float, float]:
-    """By how much a value exceeds another, relative to the other, and its standard error; both with their errors.
+    """By how much a value exceeds another, relative to the other, and its standard error; both with
+    their errors.
 
     Examples:
       >>> over((1.5, 0.03), (1.0, 0.0))
@@ -170,32 +183,57 @@ def rms(values: Sequence[float]) -> float:
     return math.sqrt(sum(value**2 for value in values) / len(values))
 
 
-def differences_in_sigmas(rows: Iterable[Mapping[str, Any]], reference: Sequence[Mapping[str, Any]]) -> list[float]:
-    """Differences of the rows of ``validation`` from the flows of ``contact_duration``, in standard errors of both."""
+def differences_in_sigmas(
+    rows: Iterable[Mapping[str, Any]], reference: Sequence[Mapping[str, Any]]
+) -> list[float]:
+    """Differences of the rows of ``validation`` from the flows of ``contact_duration``, in standard
+    errors of both.
+    """
     pairs = (
-        over((row["value"], row["error"]), at(reference, flow=[row["nu"], row["alpha"]])[row["observable"]])
+        over(
+            (row["value"], row["error"]),
+            at(reference, flow=[row["nu"], row["alpha"]])[row["observable"]],
+        )
         for row in rows
     )
     return [difference / error for difference, error in pairs]
 
 
-def product_of(rows: Iterable[Mapping[str, Any]], timestep: float, flow: Sequence[float] = (0.2, 0.6)) -> float:
-    """Measured contact pressure over Enskog's: the product of its factors in a flow of ``enskog_factors``, N = 256."""
+def product_of(
+    rows: Iterable[Mapping[str, Any]], timestep: float, flow: Sequence[float] = (0.2, 0.6)
+) -> float:
+    """Measured contact pressure over Enskog's: the product of its factors in a flow of
+    ``enskog_factors``, N = 256.
+    """
     row = at(rows, alpha=flow[0], nu=flow[1], grains=256, timestep=timestep)
     return math.prod(row[f"pressure_{name}"][0] for name in FACTORS)
 
 
-def ranked(summary: Iterable[Mapping[str, Any]], group: str, target: float) -> list[Mapping[str, Any]]:
+def ranked(
+    summary: Iterable[Mapping[str, Any]], group: str, target: float
+) -> list[Mapping[str, Any]]:
     """The solvers that solve the median problem of a group to a target, the fastest first."""
-    rows = [row for row in summary if row["group"] == group and row["target"] in (target, 0) and row["seconds"]]
+    rows = [
+        row
+        for row in summary
+        if row["group"] == group and row["target"] in (target, 0) and row["seconds"]
+    ]
     return sorted(rows, key=lambda row: row["seconds"])
 
 
-def shares_of_clusters(excesses: Iterable[float] = (0.1, 0.25, 0.45, 0.77, 1.6, 4.0)) -> list[tuple[float, float]]:
-    """Excess and share of clusters in the contact pressure, at the points of the paper's map nearest to these."""
+def shares_of_clusters(
+    excesses: Iterable[float] = (0.1, 0.25, 0.45, 0.77, 1.6, 4.0),
+) -> list[tuple[float, float]]:
+    """Excess and share of clusters in the contact pressure, at the points of the paper's map
+    nearest to these.
+    """
     data = _map("paper.nc")
-    found = np.stack([np.ravel(data.force_ratio - 1), np.ravel(data["stresses/cluster_pressure_share"])], axis=1)
-    return [tuple(min(found.tolist(), key=lambda point: abs(point[0] - excess))) for excess in excesses]
+    found = np.stack(
+        [np.ravel(data.force_ratio - 1), np.ravel(data["stresses/cluster_pressure_share"])], axis=1
+    )
+    return [
+        tuple(min(found.tolist(), key=lambda point: abs(point[0] - excess))) for excess in excesses
+    ]
 
 
 def quotients(rows: Iterable[Mapping[str, float]], one: str, other: str) -> list[float]:
@@ -204,12 +242,16 @@ def quotients(rows: Iterable[Mapping[str, float]], one: str, other: str) -> list
 
 
 def peers_ratio(flow: Mapping[str, Any]) -> str:
-    """Time of soft discs in LAMMPS, with ten steps a contact, over that of jaxgran at the same error."""
+    """Time of soft discs in LAMMPS, with ten steps a contact, over that of jaxgran at the same
+    error.
+    """
     return front.ratio(flow, "LAMMPS, 10 steps a contact", front.COST)
 
 
 def wave_exponent(row: Mapping[str, Any]) -> float:
-    """Exponent of the energy of waves across k, between wave numbers of 0.08 and 0.6/σ, in a row of ``size_study``."""
+    """Exponent of the energy of waves across k, between wave numbers of 0.08 and 0.6/σ, in a row of
+    ``size_study``.
+    """
     number, energy = (np.array(row["spectrum"][name]) for name in ("wave_number", "transverse"))
     inside = (number > 0.08) & (number < 0.6)
     return float(np.polyfit(np.log(number[inside]), np.log(energy[inside]), 1)[0])
@@ -220,7 +262,11 @@ def output_of_where(restitution: float, packing_fraction: float) -> str:
     command = f"where --restitution {restitution} --packing-fraction {packing_fraction}"
     environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1"}
     done = subprocess.run(
-        [sys.executable, "-m", "jaxgran", *command.split()], capture_output=True, text=True, check=True, env=environment
+        [sys.executable, "-m", "jaxgran", *command.split()],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=environment,
     )
     verdict, rest = done.stdout.split("\n", 1)
     lines = [line.rstrip() for line in rest.split("Enskog's contact pressure")[0].splitlines()]
@@ -245,7 +291,14 @@ for _functions in (
     (abs, max, at, found, flows_of, point, quotients, over, rms, ranked),
     (sig, percent, percent_pm, pm, duration, signed),
     (fewest_grains, shear_stress_ratio_at),
-    (peers_ratio, output_of_where, product_of, wave_exponent, shares_of_clusters, differences_in_sigmas),
+    (
+        peers_ratio,
+        output_of_where,
+        product_of,
+        wave_exponent,
+        shares_of_clusters,
+        differences_in_sigmas,
+    ),
 ):
     ENVIRONMENT.globals |= {one.__name__: one for one in _functions}
 
@@ -257,4 +310,6 @@ def filled(page: str) -> str:
 
 if __name__ == "__main__":
     for page, template in TEMPLATES.items():
-        (ROOT / page).write_text(filled((ROOT / template).read_text(encoding="utf-8")), encoding="utf-8")
+        (ROOT / page).write_text(
+            filled((ROOT / template).read_text(encoding="utf-8")), encoding="utf-8"
+        )

@@ -1,8 +1,11 @@
-"""Do the flows have the properties that the paper names, and what error has an average over 2000 time steps?
+"""Do the flows have the properties that the paper names, and what error has an average over 2000
+time steps?
 
-- ``short_averages``: the force ratio over windows of 2000 steps, N = 1000, dt = 1e-5, beside that of all windows.
-- ``order``: hexatic order, by freud, of one instant of each point of the map of ``python -m benchmarks paper``; that of
-  points at random; and of flows of equal and of different discs, N = 256, dt = 1e-3, strain 100.
+- ``short_averages``: the force ratio over windows of 2000 steps, N = 1000, dt = 1e-5, beside that
+  of all windows.
+- ``order``: hexatic order, by freud, of one instant of each point of the map of ``python -m
+  benchmarks paper``; that of points at random; and of flows of equal and of different discs, N =
+  256, dt = 1e-3, strain 100.
 
 All with the midpoint rule.
 
@@ -22,7 +25,13 @@ from benchmarks.output import RESULTS, Output, rounded
 from jaxgran.analysis.series import Measured, with_errors
 
 WINDOW = 2000  # time steps
-SHORT = ((0.9, 0.6), (0.1, 0.6), (0.5, 0.75), (0.1, 0.75), (0.5, 0.8))  # restitution, packing fraction
+SHORT = (
+    (0.9, 0.6),
+    (0.1, 0.6),
+    (0.5, 0.75),
+    (0.1, 0.75),
+    (0.5, 0.8),
+)  # restitution, packing fraction
 ORDERED = ((0.9, 0.7), (0.9, 0.75), (0.9, 0.8), (0.5, 0.75), (0.5, 0.8))
 
 
@@ -36,7 +45,10 @@ def run(output: Output) -> None:
 
 
 def prepared(
-    flows: tuple[tuple[float, float], ...], grains: int, timestep: float, polydispersity: float = 0.26
+    flows: tuple[tuple[float, float], ...],
+    grains: int,
+    timestep: float,
+    polydispersity: float = 0.26,
 ) -> tuple[jg.ShearFlow, jg.State]:
     """A batch of steady flows of given restitutions and packing fractions, and their states."""
     alphas, nus = (jnp.array(x) for x in zip(*flows, strict=True))
@@ -44,7 +56,8 @@ def prepared(
     return flow, jg.prepare(flow, jax.random.split(jax.random.key(0), len(flows)))
 
 
-# ----------------------------------------------------------------------------------------------- short averages
+# -----------------------------------------------------------------------------------------------
+# short averages
 
 
 def short_averages(quick: bool) -> list[dict]:
@@ -53,13 +66,21 @@ def short_averages(quick: bool) -> list[dict]:
     flow, state = prepared(SHORT, grains, timestep)
     _, samples = jg.sample(flow, state, windows * WINDOW * timestep, blocks=windows)
     return [
-        {"restitution": alpha, "packing_fraction": nu, "grains": grains, "timestep": timestep, **spread(samples[k])}
+        {
+            "restitution": alpha,
+            "packing_fraction": nu,
+            "grains": grains,
+            "timestep": timestep,
+            **spread(samples[k]),
+        }
         for k, (alpha, nu) in enumerate(SHORT)
     ]
 
 
 def spread(sample: jg.Sample) -> dict[str, Any]:
-    """The force ratio of a sample with its standard error, and what averages over single blocks are."""
+    """The force ratio of a sample with its standard error, and what averages over single blocks
+    are.
+    """
     impulse, binary = (np.asarray(x) for x in (sample.tally.impulse, sample.tally.binary_impulse))
     ratios = impulse[binary > 0] / binary[binary > 0]
     low, high = np.quantile(ratios, (0.025, 0.975))
@@ -73,23 +94,30 @@ def spread(sample: jg.Sample) -> dict[str, Any]:
     }
 
 
-# ----------------------------------------------------------------------------------------------- hexatic order
+# -----------------------------------------------------------------------------------------------
+# hexatic order
 
 
 def order(quick: bool) -> list[dict]:
-    """Overall and local hexatic order over the map, of points at random, and with and without polydispersity."""
+    """Overall and local hexatic order over the map, of points at random, and with and without
+    polydispersity.
+    """
     data = jg.open_map(RESULTS / "paper.nc")
     instants = data["states"].to_dataset()
     rows = []
     for nu in data.packing_fraction.values:
         here = instants.sel(packing_fraction=nu)
-        found = [hexatic(*instant(here.isel(restitution=k))) for k in range(data.sizes["restitution"])]
+        found = [
+            hexatic(*instant(here.isel(restitution=k))) for k in range(data.sizes["restitution"])
+        ]
         rows.append({"packing_fraction": float(nu), "grains": here.sizes["grain"], **ranges(found)})
         if quick:
             break
     rng, grains = np.random.default_rng(0), instants.sizes["grain"]
     at_random = [hexatic(rng.uniform(0, 30, (grains, 2)), 30.0, 0.0) for _ in range(10)]
-    rows.append({"packing_fraction": None, "points": "at random", "grains": grains, **ranges(at_random)})
+    rows.append(
+        {"packing_fraction": None, "points": "at random", "grains": grains, **ranges(at_random)}
+    )
     grains, strain, count = (64, 4.0, 4) if quick else (256, 100.0, 50)
     for width in (0.26, 0.0):
         flow, state = prepared(ORDERED, grains, 1e-3, width)
@@ -117,7 +145,9 @@ def instant(point: Any) -> tuple[np.ndarray, float, float]:
 
 
 def hexatic(positions: np.ndarray, side: float, tilt: float) -> tuple[float, float]:
-    """Overall |⟨ψ₆⟩| and local ⟨|ψ₆|⟩; ψ₆ of a grain is the mean of exp(6iθ) over its Voronoi neighbours."""
+    """Overall |⟨ψ₆⟩| and local ⟨|ψ₆|⟩; ψ₆ of a grain is the mean of exp(6iθ) over its Voronoi
+    neighbours.
+    """
     cell = freud.box.Box(side, side, xy=tilt, is2D=True), np.pad(positions, ((0, 0), (0, 1)))
     cell = cell[0], cell[0].wrap(cell[1])
     neighbours = freud.locality.Voronoi().compute(cell).nlist
@@ -127,9 +157,13 @@ def hexatic(positions: np.ndarray, side: float, tilt: float) -> tuple[float, flo
 
 def hexatic_order(states: jg.State) -> dict[str, Measured]:
     """``hexatic`` of a series of states, with standard errors."""
-    found = np.array([hexatic(*one) for one in zip(states.positions, states.side, states.tilt, strict=True)])
+    found = np.array(
+        [hexatic(*one) for one in zip(states.positions, states.side, states.tilt, strict=True)]
+    )
     sums = {"overall": found[:, 0], "local": found[:, 1], "times": np.ones(len(found))}
-    return with_errors(lambda s: {name: s[name] / s["times"] for name in ("overall", "local")}, sums)
+    return with_errors(
+        lambda s: {name: s[name] / s["times"] for name in ("overall", "local")}, sums
+    )
 
 
 def ranges(found: list[tuple[float, float]]) -> dict[str, list[float]]:

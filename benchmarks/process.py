@@ -1,4 +1,6 @@
-"""The process that a benchmark runs in: settings of JAX, which it reads when it starts, and other processes."""
+"""The process that a benchmark runs in: settings of JAX, which it reads when it starts, and other
+processes.
+"""
 
 import os
 import subprocess
@@ -10,7 +12,9 @@ ONE_CORE = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 
 def set_up(one_core: bool) -> None:
-    """Double precision, and where it is asked for one core, for this process and all that it starts."""
+    """Double precision, and where it is asked for one core, for this process and all that it
+    starts.
+    """
     if "jax" in sys.modules:
         raise RuntimeError("JAX has been imported before it was set up.")
     os.environ["JAX_ENABLE_X64"] = "1"

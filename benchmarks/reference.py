@@ -1,15 +1,19 @@
-"""The table from which ``jg.validity`` answers, made from the reference map; and whether its intervals hold.
+"""The table from which ``jg.validity`` answers, made from the reference map; and whether its
+intervals hold.
 
-The map becomes ``averages.csv`` in ``jaxgran/reference``: every average with its standard error and the bound on its
-other errors, and the shape of the Gaussian process that interpolates it, by maximum likelihood. Stresses, temperatures
-and dissipation rate are extrapolated to a large system (``sampling.budget.SIZE_LAWS``), and the error of that is in the
-bound; force ratio and factors are those of the map's numbers of grains. The better of two theories, whose pressure is
-within 10 % in most of the plane, becomes a Chebyshev series in ``theory.csv``, and so does the corrected theory. Then
-the intervals are judged: on points of the map that are left out, and on the fresh flows of ``python -m benchmarks
-reference_runs``. The maps of the paper and of a coarse time step give the force ratio at other time steps.
+The map becomes ``averages.csv`` in ``jaxgran/reference``: every average with its standard error and
+the bound on its other errors, and the shape of the Gaussian process that interpolates it, by
+maximum likelihood. Stresses, temperatures and dissipation rate are extrapolated to a large system
+(``sampling.budget.SIZE_LAWS``), and the error of that is in the bound; force ratio and factors are
+those of the map's numbers of grains. The better of two theories, whose pressure is within 10 % in
+most of the plane, becomes a Chebyshev series in ``theory.csv``, and so does the corrected theory.
+Then the intervals are judged: on points of the map that are left out, and on the fresh flows of
+``python -m benchmarks reference_runs``. The maps of the paper and of a coarse time step give the
+force ratio at other time steps.
 
-    python -m benchmarks reference              # from benchmarks/results/reference.nc, in two minutes
-    python -m benchmarks reference --quick      # into files named _quick and a folder of the output
+    python -m benchmarks reference              # from benchmarks/results/reference.nc, in two
+    minutes python -m benchmarks reference --quick      # into files named _quick and a folder of
+    the output
 """
 
 import json
@@ -59,7 +63,9 @@ SOURCE, OTHERS = "reference.nc", ("reference_coarse.nc", "paper.nc")
 
 
 def run(output: Output) -> None:
-    """Make the table, judge its intervals, draw the figure, and write ``reference`` as JSON and PNG."""
+    """Make the table, judge its intervals, draw the figure, and write ``reference`` as JSON and
+    PNG.
+    """
     folder = output.folder / "reference_quick" if output.quick else FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     others = [jg.open_map(RESULTS / name) for name in OTHERS]
@@ -69,19 +75,27 @@ def run(output: Output) -> None:
     fresh = json.loads((RESULTS / "reference_runs.json").read_text())
     rows = list(judged(table, fresh["rows"]))
     head = {"table": table.head, "left_out": left_out(table), "plane": plane(table)}
-    head |= {"fresh": {key: fresh[key] for key in ("points", "grains", "timestep")}, "coverage": coverage(rows)}
+    head |= {
+        "fresh": {key: fresh[key] for key in ("points", "grains", "timestep")},
+        "coverage": coverage(rows),
+    }
     head |= {"whole_errors": whole_errors(table)}
-    for name, found in (head["left_out"] | {f"fresh {key}": one for key, one in head["coverage"].items()}).items():
+    for name, found in (
+        head["left_out"] | {f"fresh {key}": one for key, one in head["coverage"].items()}
+    ).items():
         print(name, found)
     print(head["plane"])
     output.write_rows("reference", head, "rows", rows)
     output.write_picture(draw(table), "reference", dpi=300)
 
 
-# ------------------------------------------------------------------------------------------------ table
+# ------------------------------------------------------------------------------------------------
+# table
 
 
-def make_table(data: xr.DataTree, others: list[xr.DataTree], folder: Path, made_from: dict[str, Any]) -> None:
+def make_table(
+    data: xr.DataTree, others: list[xr.DataTree], folder: Path, made_from: dict[str, Any]
+) -> None:
     """Write both files of the table of a map into a folder."""
     flat = flattened(data).stack(point=("packing_fraction", "restitution"))
     finite = np.flatnonzero(np.isfinite(flat["pressure"].values))
@@ -89,7 +103,9 @@ def make_table(data: xr.DataTree, others: list[xr.DataTree], folder: Path, made_
     columns = {name: flat[name].values for name in ("restitution", "packing_fraction")}
     where = *columns.values(), flat["point_grains"].values
     columns["grains"] = where[-1]
-    paths = {name: name for name in (*MEASURED, RATIO)} | {"dissipation_rate": "stresses/dissipation_rate"}
+    paths = {name: name for name in (*MEASURED, RATIO)} | {
+        "dissipation_rate": "stresses/dissipation_rate"
+    }
     paths |= {f"pressure_{name}": f"theory/enskog_factor_pressure_{name}" for name in FACTORS}
     paths[LENGTH] = f"theory/{LENGTH}"
     for name, path in paths.items():
@@ -97,36 +113,63 @@ def make_table(data: xr.DataTree, others: list[xr.DataTree], folder: Path, made_
         bounded = BOUNDED_BY.get(name, name)
         if f"{bounded}_ci95" in flat:
             sources = ["timestep", "tolerance", *(["size"] if name == RATIO else [])]
-            bound = np.sqrt((flat[f"{bounded}_ci95"].sel(error_source=sources) ** 2).sum("error_source").values)
+            bound = np.sqrt(
+                (flat[f"{bounded}_ci95"].sel(error_source=sources) ** 2).sum("error_source").values
+            )
             columns[f"{name}_bound"] = bound * columns[name] / flat[bounded].values
         if name in MEASURED:
             missing = SIZE_LAWS[bounded].missing(*where)
             of_size = np.hypot(SIZE_SPREAD * missing, jamming_error(*where[1:])) * columns[name]
             columns[f"{name}_bound"] = np.hypot(columns[f"{name}_bound"], of_size)
-            columns |= {f"{name}{end}": columns[f"{name}{end}"] / (1 - missing) for end in ("", "_stderr", "_bound")}
+            columns |= {
+                f"{name}{end}": columns[f"{name}{end}"] / (1 - missing)
+                for end in ("", "_stderr", "_bound")
+            }
     for other in others:
         name = f"{RATIO}_at_{float(other.attrs['timestep']):g}"
         plane = {axis: data[axis].values for axis in ("packing_fraction", "restitution")}
-        ratios = flattened(other)[[RATIO, f"{RATIO}_stderr"]].reindex(plane, method="nearest", tolerance=1e-6)
+        ratios = flattened(other)[[RATIO, f"{RATIO}_stderr"]].reindex(
+            plane, method="nearest", tolerance=1e-6
+        )
         at_points = ratios.stack(point=("packing_fraction", "restitution")).isel(point=finite)
-        columns |= {name: at_points[RATIO].values, f"{name}_stderr": at_points[f"{RATIO}_stderr"].values}
+        columns |= {
+            name: at_points[RATIO].values,
+            f"{name}_stderr": at_points[f"{RATIO}_stderr"].values,
+        }
         paths[name] = RATIO
     theory, within = best_theory(columns)
     series = chebyshev_series(theory, columns)
-    terms = {"low": " ".join(f"{x:.12g}" for x in series.low), "high": " ".join(f"{x:.12g}" for x in series.high)}
+    terms = {
+        "low": " ".join(f"{x:.12g}" for x in series.low),
+        "high": " ".join(f"{x:.12g}" for x in series.high),
+    }
     first, second = (x.ravel() for x in np.indices((TERMS, TERMS)))
-    table_of_terms = {"first": first, "second": second, **{k: v.ravel() for k, v in series.coefficients.items()}}
-    about = {"contents": "Chebyshev series of ln(prediction) in sqrt(1 - alpha) and nu, see table.py"}
-    write_columns(folder / "theory.csv", about | {"theory": theory.__name__} | terms, table_of_terms, digits=9)
-    attributes = {name: data.attrs[name] for name in ("timestep", "seeds", "polydispersity", "activation")}
+    table_of_terms = {
+        "first": first,
+        "second": second,
+        **{k: v.ravel() for k, v in series.coefficients.items()},
+    }
+    about = {
+        "contents": "Chebyshev series of ln(prediction) in sqrt(1 - alpha) and nu, see table.py"
+    }
+    write_columns(
+        folder / "theory.csv", about | {"theory": theory.__name__} | terms, table_of_terms, digits=9
+    )
+    attributes = {
+        name: data.attrs[name] for name in ("timestep", "seeds", "polydispersity", "activation")
+    }
     head: dict[str, Any] = {
-        "contents": "averages of the reference map of jaxgran in units of m, sigma and 1/shear rate, see table.py",
+        "contents": "averages of the reference map of jaxgran in units of m, sigma and 1/shear "
+        "rate, see table.py",
         "grains": " or ".join(str(size) for size in sorted(set(where[-1].tolist()), reverse=True))
         + ", extrapolated to a large system",
         **{name: f"{x:g}" if isinstance(x, float) else str(x) for name, x in attributes.items()},
         "map commit": data.attrs["commit"],
         **made_from,
-        **{f"share of the plane with the pressure of {name} within 10 %": f"{x:.3f}" for name, x in within.items()},
+        **{
+            f"share of the plane with the pressure of {name} within 10 %": f"{x:.3f}"
+            for name, x in within.items()
+        },
     }
     bare = Table({}, columns, series)
     for name in paths:
@@ -138,17 +181,23 @@ def make_table(data: xr.DataTree, others: list[xr.DataTree], folder: Path, made_
 
 
 def best_theory(columns: dict[str, np.ndarray]) -> tuple[Callable, dict[str, float]]:
-    """The theory whose pressure is within 10 % in most of the plane, and the share of the plane for each theory."""
+    """The theory whose pressure is within 10 % in most of the plane, and the share of the plane for
+    each theory.
+    """
     flows = columns["restitution"], columns["packing_fraction"]
     weights, within = areas(*flows), {}
     for name, theory in THEORIES.items():
-        predicted = np.asarray(jax.vmap(lambda *flow, theory=theory: theory(*flow).pressure)(*flows))
+        predicted = np.asarray(
+            jax.vmap(lambda *flow, theory=theory: theory(*flow).pressure)(*flows)
+        )
         within[name] = float(np.mean(weights * (np.abs(predicted / columns["pressure"] - 1) < 0.1)))
     return THEORIES[max(within, key=within.__getitem__)], within
 
 
 def chebyshev_series(theory: Callable, columns: dict[str, np.ndarray]) -> Series:
-    """The series of the logarithms of the predictions of a theory and of the corrected one, over the columns' range."""
+    """The series of the logarithms of the predictions of a theory and of the corrected one, over
+    the columns' range.
+    """
     alphas, nus = columns["restitution"], columns["packing_fraction"]
     low = np.array([np.sqrt(1 - alphas.max()), nus.min()])
     high = np.array([np.sqrt(1 - alphas.min()), nus.max()])
@@ -168,7 +217,9 @@ def chebyshev_series(theory: Callable, columns: dict[str, np.ndarray]) -> Series
 
 
 def fitted_shape(table: Table, name: str) -> Shape:
-    """The shape of the surface of an average: the largest likelihood, with weak priors of its four logarithms."""
+    """The shape of the surface of an average: the largest likelihood, with weak priors of its four
+    logarithms.
+    """
     surface = table.surface(name, Shape(1.0, (1.0, 1.0)))
     priors, widths = np.array([-1.0, 0.5, 0.5, 0.0]), np.array([3.0, 1.5, 1.5, 0.5])
 
@@ -177,18 +228,26 @@ def fitted_shape(table: Table, name: str) -> Shape:
         return Shape(float(amplitude), (float(first), float(second)), float(noise))
 
     def cost(logs: np.ndarray) -> float:
-        likelihood = type(surface)(surface.points, surface.values, surface.stderrs, with_shape(logs)).log_likelihood()
+        likelihood = type(surface)(
+            surface.points, surface.values, surface.stderrs, with_shape(logs)
+        ).log_likelihood()
         return -likelihood + float(np.sum(((logs - priors) / widths) ** 2)) / 2
 
     enough = {"xatol": 0.02, "fatol": 0.02}
-    best = min((minimize(cost, one, method="Nelder-Mead", options=enough) for one in START), key=lambda one: one.fun)
+    best = min(
+        (minimize(cost, one, method="Nelder-Mead", options=enough) for one in START),
+        key=lambda one: one.fun,
+    )
     shape = with_shape(best.x)
-    errors, expected = type(surface)(surface.points, surface.values, surface.stderrs, shape).left_out()
+    errors, expected = type(surface)(
+        surface.points, surface.values, surface.stderrs, shape
+    ).left_out()
     scatter = float(np.sqrt(np.mean((errors / expected) ** 2)))
     return Shape(shape.amplitude, shape.lengths, shape.noise, max(1.0, scatter))
 
 
-# -------------------------------------------------------------------------------------------- intervals
+# --------------------------------------------------------------------------------------------
+# intervals
 
 
 def left_out(table: Table) -> dict[str, dict[str, float]]:
@@ -207,7 +266,8 @@ def left_out(table: Table) -> dict[str, dict[str, float]]:
 def whole_errors(table: Table) -> dict[str, Any]:
     """Half-widths of the 95 % intervals at the points of the map, relative to the averages.
 
-    For each average the median, the share of points within 3 %, and the largest for every packing fraction.
+    For each average the median, the share of points within 3 %, and the largest for every packing
+    fraction.
     """
     nus, found = table.columns["packing_fraction"], {}
     for name in (*AVERAGES, "dissipation_rate"):
@@ -222,11 +282,13 @@ def whole_errors(table: Table) -> dict[str, Any]:
 
 
 def judged(table: Table, rows: list[dict[str, Any]]) -> Any:
-    """For every fresh flow, ln(measured/table) of every average and the half-widths of its two intervals.
+    """For every fresh flow, ln(measured/table) of every average and the half-widths of its two
+    intervals.
 
-    The whole interval is that of ``jg.validity``. The other one leaves out the bounds: sampling and interpolation only.
-    The errors of the fresh flow are added to both. What is missing at its number of grains is added to its averages by
-    the law that the table was made with, so neither interval tests this law.
+    The whole interval is that of ``jg.validity``. The other one leaves out the bounds: sampling and
+    interpolation only. The errors of the fresh flow are added to both. What is missing at its
+    number of grains is added to its averages by the law that the table was made with, so neither
+    interval tests this law.
     """
     for row in rows:
         where = coordinates(row["restitution"], row["packing_fraction"])
@@ -234,7 +296,9 @@ def judged(table: Table, rows: list[dict[str, Any]]) -> Any:
         for name in MEASURED:
             log, stderr = table.surfaces[name](where)
             bounded = BOUNDED_BY.get(name, name)
-            missing = SIZE_LAWS[bounded].missing(row["restitution"], row["packing_fraction"], row["grains"])
+            missing = SIZE_LAWS[bounded].missing(
+                row["restitution"], row["packing_fraction"], row["grains"]
+            )
             expected = log + table.series(where)[theory_of(name)] + np.log1p(-missing)
             known = [row[f"{bounded}_{part}"] / row[bounded] for part in ("timestep", "tolerance")]
             own = np.hypot(HALF_INTERVAL * row[f"{name}_stderr"] / row[name], np.hypot(*known))
@@ -242,7 +306,8 @@ def judged(table: Table, rows: list[dict[str, Any]]) -> Any:
             whole = np.hypot(narrow, np.exp(table.bounds[name](where)[0]))
             values = np.log(row[name]) - expected, narrow, whole
             one |= {
-                f"{name}{end}": round(float(x), 5) for end, x in zip(("", "_narrow", "_whole"), values, strict=True)
+                f"{name}{end}": round(float(x), 5)
+                for end, x in zip(("", "_narrow", "_whole"), values, strict=True)
             }
         yield one
 
@@ -251,7 +316,9 @@ def coverage(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
     """Share of the fresh flows within both intervals, mean and rms difference."""
     found = {}
     for name in MEASURED:
-        apart, narrow, whole = (np.array([row[f"{name}{end}"] for row in rows]) for end in ("", "_narrow", "_whole"))
+        apart, narrow, whole = (
+            np.array([row[f"{name}{end}"] for row in rows]) for end in ("", "_narrow", "_whole")
+        )
         found[name] = {
             "covered": round(float(np.mean(np.abs(apart) < whole)), 3),
             "covered_narrow": round(float(np.mean(np.abs(apart) < narrow)), 3),
@@ -262,13 +329,16 @@ def coverage(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
     return found
 
 
-# ------------------------------------------------------------------------------------------------ plane
+# ------------------------------------------------------------------------------------------------
+# plane
 
 
 def plane(table: Table) -> dict[str, Any]:
-    """Shares of the plane of ln(1 − α) and ν, and of its binary part, where the theory's pressure is within limits.
+    """Shares of the plane of ln(1 − α) and ν, and of its binary part, where the theory's pressure
+    is within limits.
 
-    In the binary part the force ratio is below 1.05. Its worst point is that of the map with the lowest prediction.
+    In the binary part the force ratio is below 1.05. Its worst point is that of the map with the
+    lowest prediction.
     """
     alphas, nus = table.columns["restitution"], table.columns["packing_fraction"]
     x, y = (
@@ -289,7 +359,9 @@ def plane(table: Table) -> dict[str, Any]:
         share = {
             "share": 1 - np.mean(outside),
             "share_at_least": np.mean((low < limit) & (high < limit)),
-            "share_at_most": np.mean((low < limit) | (high < limit) | ~outside | ((over - half) * (over + half) < 0)),
+            "share_at_most": np.mean(
+                (low < limit) | (high < limit) | ~outside | ((over - half) * (over + half) < 0)
+            ),
             "share_of_binary": np.mean(~outside[binary]),
         }
         found[f"{limit:g}"] = {name: round(float(x), 3) for name, x in share.items()}

@@ -1,4 +1,6 @@
-"""The figure of the reference table: where kinetic theory predicts the pressure, at the width of one column."""
+"""The figure of the reference table: where kinetic theory predicts the pressure, at the width of
+one column.
+"""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -43,7 +45,9 @@ def draw(table: Table) -> Figure:
     _draw_errors(axes, table, x, y, where)
     handles = [Patch(facecolor=REGIONS[name][0], label=REGIONS[name][1]) for name in drawn]
     handles.append(Line2D([], [], color="black", linewidth=0.9, label="error of the pressure"))
-    handles.append(Patch(facecolor="black", alpha=0.25, label=f"95 % interval of ±{100 * BANDED:.0f} %"))
+    handles.append(
+        Patch(facecolor="black", alpha=0.25, label=f"95 % interval of ±{100 * BANDED:.0f} %")
+    )
     for style, (timestep, surface) in zip(LINES, sorted(table.ratios.items()), strict=False):
         excess = excess_from_surface(surface(where)[0])
         axes.contour(x, y, excess, [BINARY], colors=GREEN, linestyles=[style], linewidths=1.6)
@@ -69,7 +73,9 @@ def draw(table: Table) -> Figure:
     return figure
 
 
-def _draw_regions(axes: Axes, table: Table, x: np.ndarray, y: np.ndarray, where: np.ndarray) -> list[str]:
+def _draw_regions(
+    axes: Axes, table: Table, x: np.ndarray, y: np.ndarray, where: np.ndarray
+) -> list[str]:
     """Shade by the factor that is furthest from one; return those that are."""
     logs = np.abs([table.surfaces[f"pressure_{name}"](where)[0] for name in FACTORS])
     furthest = np.argmax(logs, axis=0)
@@ -90,10 +96,17 @@ def _draw_errors(axes: Axes, table: Table, x: np.ndarray, y: np.ndarray, where: 
     for level in (-BANDED, BANDED):
         in_interval = np.abs(np.log1p(level) + over) - half
         axes.contourf(x, y, in_interval, [-9, 0], colors=["black"], alpha=0.12, zorder=1)
-    lines = axes.contour(x, y, error, LEVELS, colors="black", linestyles="-", linewidths=0.9, zorder=2)
+    lines = axes.contour(
+        x, y, error, LEVELS, colors="black", linestyles="-", linewidths=0.9, zorder=2
+    )
     places = []
     for level, at in LABELLED.items():
         column = error[:, np.argmin(np.abs(x - at))]
         crossed = np.flatnonzero((column[:-1] - level) * (column[1:] - level) < 0)
         places += [(at, y[crossed[-1]])] if crossed.size else []
-    axes.clabel(lines, fmt=lambda level: f"{100 * level:+.0f} %".replace("-", "−"), fontsize=7, manual=places)
+    axes.clabel(
+        lines,
+        fmt=lambda level: f"{100 * level:+.0f} %".replace("-", "−"),
+        fontsize=7,
+        manual=places,
+    )

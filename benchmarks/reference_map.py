@@ -1,17 +1,19 @@
-"""The reference map: averages of large systems over the plane of restitution and packing fraction, at dt = 1e-4.
+"""The reference map: averages of large systems over the plane of restitution and packing fraction,
+at dt = 1e-4.
 
-Packing fractions are 0.01 apart where averages change fast, and restitutions are close where grains cluster. Loose
-flows depend on N and have 6400 grains, dense ones 1600. Every seed is a map of its own, sampled over six correlation
-strains of each flow, and kept beside the results; all are merged. So a run that was stopped goes on, and another seed
-makes all errors smaller. Flows of several sizes say how averages approach those of a large system
-(``python -m benchmarks size_limits``), and a map at dt = 1e-3 what becomes of the force ratio.
+Packing fractions are 0.01 apart where averages change fast, and restitutions are close where grains
+cluster. Loose flows depend on N and have 6400 grains, dense ones 1600. Every seed is a map of its
+own, sampled over six correlation strains of each flow, and kept beside the results; all are merged.
+So a run that was stopped goes on, and another seed makes all errors smaller. Flows of several sizes
+say how averages approach those of a large system (``python -m benchmarks size_limits``), and a map
+at dt = 1e-3 what becomes of the force ratio.
 
-    python -m benchmarks reference_map                 # two hours on two cores
-    python -m benchmarks reference_map --seeds 4       # two seeds more
-    python -m benchmarks reference_map --part sizes    # 9 loose flows of up to 25,600 grains, 12 dense ones
-    python -m benchmarks reference_map --part large    # one flow of 102,400 grains, half an hour
-    python -m benchmarks reference_map --part coarse   # dt = 1e-3
-    python -m benchmarks reference_map --quick         # a plane of 3 × 3 points, 64 and 100 grains, a minute
+    python -m benchmarks reference_map                 # two hours on two cores python -m benchmarks
+    reference_map --seeds 4       # two seeds more python -m benchmarks reference_map --part sizes
+    # 9 loose flows of up to 25,600 grains, 12 dense ones python -m benchmarks reference_map --part
+    large    # one flow of 102,400 grains, half an hour python -m benchmarks reference_map --part
+    coarse   # dt = 1e-3 python -m benchmarks reference_map --quick         # a plane of 3 × 3
+    points, 64 and 100 grains, a minute
 """
 
 from pathlib import Path
@@ -32,9 +34,13 @@ DENSE = (0.72, 0.73, 0.74, 0.75, 0.76, 0.77, 0.78, 0.79, 0.8, 0.81, 0.82, 0.83)
 
 def plane(quick: bool) -> dict[str, Any]:
     """The arguments of ``ratio_map`` for one seed."""
-    alphas, loose, dense = ((0.1, 0.5, 0.9), (0.5, 0.7), (0.8,)) if quick else (RESTITUTIONS, LOOSE, DENSE)
+    alphas, loose, dense = (
+        ((0.1, 0.5, 0.9), (0.5, 0.7), (0.8,)) if quick else (RESTITUTIONS, LOOSE, DENSE)
+    )
     sizes = (100, 64) if quick else (6400, 1600)
-    grains = [size for nus, size in zip((loose, dense), sizes, strict=True) for _ in nus for _ in alphas]
+    grains = [
+        size for nus, size in zip((loose, dense), sizes, strict=True) for _ in nus for _ in alphas
+    ]
     return {
         "restitution": alphas,
         "packing_fraction": loose + dense,
@@ -46,22 +52,44 @@ def plane(quick: bool) -> dict[str, Any]:
 def sizes(quick: bool) -> dict[str, dict[str, Any]]:
     """The arguments of ``ratio_map`` for several numbers of grains, of loose and of dense flows."""
     loose = {"restitution": (0.1, 0.4, 0.7), "packing_fraction": (0.2, 0.4, 0.6), "timestep": 5e-4}
-    dense = {"restitution": (0.1, 0.5, 0.9), "packing_fraction": (0.7, 0.74, 0.77, 0.8), "timestep": 2e-4}
+    dense = {
+        "restitution": (0.1, 0.5, 0.9),
+        "packing_fraction": (0.7, 0.74, 0.77, 0.8),
+        "timestep": 2e-4,
+    }
     grains = (64, 256) if quick else (400, 1600, 6400, 25600)
-    return {"sizes_loose": loose | {"grains": grains}, "sizes_dense": dense | {"grains": grains[:3]}}
+    return {
+        "sizes_loose": loose | {"grains": grains},
+        "sizes_dense": dense | {"grains": grains[:3]},
+    }
 
 
 def large(quick: bool) -> dict[str, dict[str, Any]]:
-    """The arguments of ``ratio_map`` for a flow of four times as many grains as those of ``sizes``."""
+    """The arguments of ``ratio_map`` for a flow of four times as many grains as those of
+    ``sizes``.
+    """
     chosen = {"restitution": (0.7,), "packing_fraction": (0.6,), "timestep": 5e-4}
     return {"large": chosen | {"grains": 512 if quick else 102_400}}
 
 
 def coarse(quick: bool) -> dict[str, dict[str, Any]]:
-    """The arguments of ``ratio_map`` at dt = 1e-3, where grains are slow enough for it and clusters form."""
-    alphas, nus = [a for a in RESTITUTIONS if a <= 0.7], [nu for nu in (*LOOSE, *DENSE) if 0.3 <= nu <= 0.79]
-    chosen: dict[str, Any] = {"restitution": alphas, "packing_fraction": nus, "grains": 1000, "timestep": 1e-3}
-    return {"coarse": chosen | ({"restitution": (0.1, 0.5), "packing_fraction": (0.6,), "grains": 64} if quick else {})}
+    """The arguments of ``ratio_map`` at dt = 1e-3, where grains are slow enough for it and clusters
+    form.
+    """
+    alphas, nus = (
+        [a for a in RESTITUTIONS if a <= 0.7],
+        [nu for nu in (*LOOSE, *DENSE) if 0.3 <= nu <= 0.79],
+    )
+    chosen: dict[str, Any] = {
+        "restitution": alphas,
+        "packing_fraction": nus,
+        "grains": 1000,
+        "timestep": 1e-3,
+    }
+    return {
+        "coarse": chosen
+        | ({"restitution": (0.1, 0.5), "packing_fraction": (0.6,), "grains": 64} if quick else {})
+    }
 
 
 def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT) -> None:
@@ -71,13 +99,22 @@ def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT
     about = {"command": "python -m benchmarks reference_map", "commit": output.hardware["commit"]}
 
     def made(name: str, **chosen: Any) -> xr.DataTree:
-        kept = {"output": folder / f"{name}.nc", "resume": True, "progress": True, "attributes": about}
+        kept = {
+            "output": folder / f"{name}.nc",
+            "resume": True,
+            "progress": True,
+            "attributes": about,
+        }
         return jg.ratio_map(**chosen, **kept, seeds=1, workers=usable_cores())
 
     if part == "plane":
-        merged = jg.merge_maps([made(f"seed_{k}", **plane(output.quick), first_seed=k) for k in range(seeds)])
+        merged = jg.merge_maps(
+            [made(f"seed_{k}", **plane(output.quick), first_seed=k) for k in range(seeds)]
+        )
         merged.attrs["command"] = about["command"]
         write_dataset(merged, output.path("reference", ".nc"))
         return
-    for name, chosen in {"sizes": sizes, "large": large, "coarse": coarse}[part](output.quick).items():
+    for name, chosen in {"sizes": sizes, "large": large, "coarse": coarse}[part](
+        output.quick
+    ).items():
         write_dataset(made(name, **chosen), output.path("reference", f"_{name}.nc"))

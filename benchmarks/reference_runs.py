@@ -1,7 +1,7 @@
 """Fresh flows at random points of the reference map, which its intervals are judged on.
 
-40 points, uniform in ln(1 − α) and ν over the range of the map; N = 6400 up to ν = 0.71 and 2500 above, dt = 1e-4, one
-run per point sampled over six correlation strains. Nothing is fitted to them.
+40 points, uniform in ln(1 − α) and ν over the range of the map; N = 6400 up to ν = 0.71 and 2500
+above, dt = 1e-4, one run per point sampled over six correlation strains. Nothing is fitted to them.
 
     python -m benchmarks reference_runs           # 20 minutes on one core
     python -m benchmarks reference_runs --quick   # 3 points of 64 grains, dt = 1e-3, under a minute
@@ -18,7 +18,13 @@ from benchmarks.output import Output
 from benchmarks.reference_map import DENSE, LOOSE, RESTITUTIONS
 from jaxgran.maps.schema import flattened
 
-OBSERVABLES = ("pressure", "shear_stress", "granular_temperature", "local_granular_temperature", "force_ratio")
+OBSERVABLES = (
+    "pressure",
+    "shear_stress",
+    "granular_temperature",
+    "local_granular_temperature",
+    "force_ratio",
+)
 FULL = {"points": 40, "grains": [6400, 2500], "timestep": 1e-4}  # of loose and of dense flows
 QUICK = {"points": 3, "grains": [64, 64], "timestep": 1e-4}
 FIRST_SEED = 9000  # of no map
@@ -30,7 +36,10 @@ def run(output: Output) -> None:
     rows = []
     for row in fresh_rows(**plan):
         rows.append(row)
-        print(f"{len(rows)} of {plan['points']}: {row}, {time.perf_counter() - start:.0f} s", flush=True)
+        print(
+            f"{len(rows)} of {plan['points']}: {row}, {time.perf_counter() - start:.0f} s",
+            flush=True,
+        )
     head = {**plan, "first_seed": FIRST_SEED, "seconds": round(time.perf_counter() - start)}
     output.write_rows("reference_runs", head, "rows", rows)
 
@@ -46,7 +55,11 @@ def random_points(count: int) -> Iterator[tuple[float, float]]:
 def fresh_rows(points: int, grains: list[int], timestep: float) -> Iterator[dict]:
     """Averages, standard errors and the bounds of timestep and tolerance of every point."""
     for k, (alpha, nu) in enumerate(random_points(points)):
-        one = {"restitution": alpha, "packing_fraction": nu, "grains": grains[nu > (LOOSE[-1] + DENSE[0]) / 2]}
+        one = {
+            "restitution": alpha,
+            "packing_fraction": nu,
+            "grains": grains[nu > (LOOSE[-1] + DENSE[0]) / 2],
+        }
         data = jg.ratio_map(**one, timestep=timestep, seeds=1, first_seed=FIRST_SEED + k, workers=1)
         yield one | _row(data)
 
@@ -59,7 +72,10 @@ def _row(data: xr.DataTree) -> dict[str, float]:
         for source in ("timestep", "tolerance"):
             row[f"{name}_{source}"] = _short(point[f"{name}_ci95"].sel(error_source=source))
     rate = "stresses/dissipation_rate"
-    return row | {"dissipation_rate": _short(point[rate]), "dissipation_rate_stderr": _short(point[f"{rate}_stderr"])}
+    return row | {
+        "dissipation_rate": _short(point[rate]),
+        "dissipation_rate_stderr": _short(point[f"{rate}_stderr"]),
+    }
 
 
 def _short(value: xr.DataArray) -> float:

@@ -1,4 +1,6 @@
-"""All benchmarks: what each asks, how long it takes, what it writes, and its own options. Imports nothing heavy."""
+"""All benchmarks: what each asks, how long it takes, what it writes, and its own options. Imports
+nothing heavy.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,7 +8,8 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Option:
-    """An option of one benchmark, given to its ``run`` under the same name; without it the default there holds.
+    """An option of one benchmark, given to its ``run`` under the same name; without it the default
+    there holds.
 
     A name without dashes is a file, which may be left out. The kind ``bool`` is a flag.
     """
@@ -21,8 +24,9 @@ class Option:
 class Benchmark:
     """A benchmark: its module has a function ``run`` that takes an ``Output`` and the options.
 
-    ``minutes`` are those of a full and of a quick run on two cores of a desktop processor. ``files`` are the committed
-    results in ``benchmarks/results``. ``one_core`` says that JAX is held to one core.
+    ``minutes`` are those of a full and of a quick run on two cores of a desktop processor.
+    ``files`` are the committed results in ``benchmarks/results``. ``one_core`` says that JAX is
+    held to one core.
     """
 
     name: str
@@ -53,7 +57,7 @@ BENCHMARKS = (
     ),
     Benchmark(
         "paper",
-        "Where in the plane of restitution and packing fraction are binary collisions all there is?",
+        "Where in the plane are binary collisions all there is?",
         (20, 0.5),
         (
             "paper.nc",
@@ -62,15 +66,20 @@ BENCHMARKS = (
     ),
     Benchmark(
         "paper_claims",
-        "Do the flows have the properties that the paper names, and what error has an average over 2000 time steps?",
+        "Do the flows have the properties that the paper names, and what error has an average over "
+        "2000 time steps?",
         (6, 0.5),
         ("paper_claims.json",),
     ),
     Benchmark(
         "reference_map",
-        "What are stresses, temperatures and the dissipation rate of large systems over the whole plane?",
+        "What are stresses, temperatures and the dissipation rate of large systems over the whole "
+        "plane?",
         (120, 1),
-        ("reference.nc", *(f"reference_{name}.nc" for name in ("sizes_loose", "sizes_dense", "large", "coarse"))),
+        (
+            "reference.nc",
+            *(f"reference_{name}.nc" for name in ("sizes_loose", "sizes_dense", "large", "coarse")),
+        ),
         (
             Option("--seeds", "number of seeds, those that are kept included", int),
             Option(
@@ -83,7 +92,8 @@ BENCHMARKS = (
     ),
     Benchmark(
         "reference_runs",
-        "What are stresses and temperatures at random points that no table of `jg.validity` has seen?",
+        "What are stresses and temperatures at random points that no table of `jg.validity` has "
+        "seen?",
         (20, 0.5),
         ("reference_runs.json",),
     ),
@@ -96,7 +106,8 @@ BENCHMARKS = (
     ),
     Benchmark(
         "dissipation",
-        "How much less than Enskog's is the dissipation rate, and does a theory with a law of it predict other flows?",
+        "How much less than Enskog's is the dissipation rate, and does a theory with a law of it "
+        "predict other flows?",
         (2, 1),
         ("dissipation.json", "dissipation.png"),
     ),
@@ -115,7 +126,8 @@ BENCHMARKS = (
     ),
     Benchmark(
         "dense_limit",
-        "Are dense flows compatible with the exponents that are published for the jamming transition?",
+        "Are dense flows compatible with the exponents that are published for the jamming "
+        "transition?",
         (0.1, 0.1),
         ("dense_limit.json", "dense_limit.png"),
     ),
@@ -164,13 +176,15 @@ BENCHMARKS = (
     ),
     Benchmark(
         "many_replicas",
-        "Which way to advance many replicas is the fastest, and what does it take to compile and to hold?",
+        "Which way to advance many replicas is the fastest, and what does it take to compile and "
+        "to hold?",
         (2, 1),
         ("many_replicas.json",),
     ),
     Benchmark(
         "device_batch",
-        "How many replica-steps per second does this device make, beside one core of the numba loop?",
+        "How many replica-steps per second does this device make, beside one core of the numba "
+        "loop?",
         (3, 1),
         options=(Option("--paper", "the map of the paper, too", bool),),
     ),
@@ -231,7 +245,11 @@ BENCHMARKS = (
         "How often do 95 % intervals hold, against the sampled strain and the number of seeds?",
         (6, 0.5),
         ("coverage.json", "coverage_error.json"),
-        options=(Option("--error", "judge samples that end at this error, into coverage_error.json", float),),
+        options=(
+            Option(
+                "--error", "judge samples that end at this error, into coverage_error.json", float
+            ),
+        ),
         one_core=True,
     ),
     Benchmark(

@@ -1,7 +1,8 @@
 """How cost and memory grow with the number of grains, and cost with the time step.
 
-Every size of a flow is measured in its own process, with its peak resident memory. Seconds are CPU time, which does not
-count what else runs on a machine. The exponent of each growth is a least-squares fit to the logarithms.
+Every size of a flow is measured in its own process, with its peak resident memory. Seconds are CPU
+time, which does not count what else runs on a machine. The exponent of each growth is a
+least-squares fit to the logarithms.
 
     python -m benchmarks scaling           # up to 1e6 grains; 4 minutes
     python -m benchmarks scaling --quick   # up to 1e4 grains; most of it compilation
@@ -29,11 +30,16 @@ LARGE_FLOW = (0.8, 0.6)  # restitution, packing fraction
 DENSE_FLOW = (0.5, 0.8)
 STRAIN = 0.1  # of a timing
 REPEATS = 5
-LINEAR = 1_000, 100_000  # grains: smaller flows have steps without a contact, larger ones outgrow the caches
+LINEAR = (
+    1_000,
+    100_000,
+)  # grains: smaller flows have steps without a contact, larger ones outgrow the caches
 
 
 def run(output: Output, grains: int | None = None) -> None:
-    """Measure all growths, print, and write JSON and PNG; or print one flow of so many grains as JSON."""
+    """Measure all growths, print, and write JSON and PNG; or print one flow of so many grains as
+    JSON.
+    """
     if grains is not None:
         print(json.dumps(large_flow(grains)))
         return
@@ -55,12 +61,17 @@ def in_own_process(grains: int) -> dict[str, float]:
 
 
 def large_flow(grains: int) -> dict[str, float]:
-    """Time and memory of one flow from a random packing: sheared to a strain of 2 STRAIN, timed over STRAIN."""
+    """Time and memory of one flow from a random packing: sheared to a strain of 2 STRAIN, timed
+    over STRAIN.
+    """
     alpha, nu = LARGE_FLOW
     flow = jg.ShearFlow(grains, alpha, nu, 1e-3)
     before, wall = time.process_time(), time.perf_counter()
     state = jax.block_until_ready(jg.prepare(flow, jax.random.key(0), equilibrate=2 * STRAIN))
-    prepared = {"prepare cpu seconds": time.process_time() - before, "prepare seconds": time.perf_counter() - wall}
+    prepared = {
+        "prepare cpu seconds": time.process_time() - before,
+        "prepare seconds": time.perf_counter() - wall,
+    }
     start = time.process_time()
     compiled = jax.jit(jg.advance).lower(flow, state, jnp.int32(1)).compile()
     compilation = time.process_time() - start
@@ -71,15 +82,21 @@ def large_flow(grains: int) -> dict[str, float]:
         "compile cpu seconds": round(compilation, 2),
         "seconds": seconds["wall"],
         "cpu seconds": seconds["cpu"],
-        "microseconds per grain and step": float(f"{1e6 * seconds['cpu'] / (grains * float(tally.steps)):.4g}"),
+        "microseconds per grain and step": float(
+            f"{1e6 * seconds['cpu'] / (grains * float(tally.steps)):.4g}"
+        ),
         "contacts per solve": round(float(tally.contacts / tally.solves), 2),
         "status": jg.Status(int(tally.status)).name,
         "peak resident MiB": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
     }
 
 
-def timed(compiled, flow: jg.ShearFlow, state: jg.State, strain: float) -> tuple[jg.State, dict[str, float], jg.Tally]:
-    """The state after a strain, seconds of the processor and of the clock (medians), and the tally."""
+def timed(
+    compiled, flow: jg.ShearFlow, state: jg.State, strain: float
+) -> tuple[jg.State, dict[str, float], jg.Tally]:
+    """The state after a strain, seconds of the processor and of the clock (medians), and the
+    tally.
+    """
     steps = jnp.int32(round(strain / float(flow.timestep)))
     seconds = {"cpu": [], "wall": []}
     for _ in range(REPEATS):
@@ -101,8 +118,16 @@ def timesteps(at: tuple[float, float], dts: tuple[float, ...]) -> list[dict[str,
         state, _, _ = timed(compiled, shorter, state, STRAIN)
         state, seconds, tally = timed(compiled, shorter, state, STRAIN)
         contacts = float(tally.contacts / tally.solves)
-        row = {"alpha": at[0], "nu": at[1], "timestep": dt, "cpu seconds per strain": seconds["cpu"] / STRAIN}
-        rows.append(row | {"solves per step": float(tally.solves / tally.steps), "contacts per solve": contacts})
+        row = {
+            "alpha": at[0],
+            "nu": at[1],
+            "timestep": dt,
+            "cpu seconds per strain": seconds["cpu"] / STRAIN,
+        }
+        rows.append(
+            row
+            | {"solves per step": float(tally.solves / tally.steps), "contacts per solve": contacts}
+        )
     return rows
 
 
@@ -112,7 +137,9 @@ def flow_of_arrays(flow: jg.ShearFlow) -> jg.ShearFlow:
 
 
 def exponents(rows: dict[str, list[dict]]) -> dict[str, float]:
-    """Exponents of cost against the number of grains and the time step, from where it is a power law."""
+    """Exponents of cost against the number of grains and the time step, from where it is a power
+    law.
+    """
 
     def fitted(points: list[dict], x: str, y: str) -> float:
         logs = np.log([[point[x], point[y]] for point in points])
@@ -121,7 +148,9 @@ def exponents(rows: dict[str, list[dict]]) -> dict[str, float]:
     large = [row for row in rows["grains"] if LINEAR[0] <= row["grains"] <= LINEAR[1]]
     by_flow = {
         f"timestep at α = {at[0]:g}, ν = {at[1]:g}": fitted(
-            [row for row in rows["timestep"] if (row["alpha"], row["nu"]) == at], "timestep", "cpu seconds per strain"
+            [row for row in rows["timestep"] if (row["alpha"], row["nu"]) == at],
+            "timestep",
+            "cpu seconds per strain",
         )
         for at in (LARGE_FLOW, DENSE_FLOW)
     }
@@ -137,10 +166,15 @@ def report(rows: dict[str, list[dict]], fits: dict[str, float]) -> None:
         print(f"exponent of the cost against {name}: {value:.3f}")
     first, *larger = (row for row in rows["grains"] if row["grains"] >= LINEAR[0])  # of one program
     for row in larger:
-        resident = (row["peak resident MiB"] - first["peak resident MiB"]) * 2**20 / (row["grains"] - first["grains"])
+        resident = (
+            (row["peak resident MiB"] - first["peak resident MiB"])
+            * 2**20
+            / (row["grains"] - first["grains"])
+        )
         print(
             f"{row['grains']} grains for a strain of {STRAIN:g}: {row['seconds']:.3g} s, peak "
-            f"{row['peak resident MiB']} MiB; {resident:.0f} bytes more for each grain than {first['grains']} have"
+            f"{row['peak resident MiB']} MiB; {resident:.0f} bytes more for each grain than "
+            f"{first['grains']} have"
         )
 
 

@@ -4,10 +4,24 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TWO_COLUMNS, curve_styles, label_log_axis, styled
+from jaxgran.plotting.drawing import (
+    LABEL_SIZE,
+    SMALL_SIZE,
+    TWO_COLUMNS,
+    curve_styles,
+    label_log_axis,
+    styled,
+)
 
 LOOSE = 0.7  # packing fraction up to which a flow is drawn among the loose ones
-WAVE_FLOWS = ((0.1, 0.3), (0.2, 0.6), (0.5, 0.6), (0.8, 0.2), (0.8, 0.6), (0.95, 0.6))  # of the figure of waves
+WAVE_FLOWS = (
+    (0.1, 0.3),
+    (0.2, 0.6),
+    (0.5, 0.6),
+    (0.8, 0.2),
+    (0.8, 0.6),
+    (0.95, 0.6),
+)  # of the figure of waves
 STYLES = [
     {"color": "black", "marker": "o", "linestyle": "-"},
     {"color": "tab:blue", "marker": "s", "linestyle": "--"},
@@ -41,7 +55,9 @@ def flow_name(alpha: float, nu: float) -> str:
 
 @styled
 def draw_sizes(rows: list[dict]) -> Figure:
-    """Values against N, relative to the largest one; a column for each kind of flow, with standard errors."""
+    """Values against N, relative to the largest one; a column for each kind of flow, with standard
+    errors.
+    """
     groups = [(name, [row for row in rows if inside(row)]) for name, inside in GROUPS]
     groups = [(name, chosen) for name, chosen in groups if chosen]
     figure = Figure(figsize=(TWO_COLUMNS, 8.0), layout="constrained")
@@ -74,15 +90,33 @@ def draw_curve(axes: Axes, name: str, rows: list[dict], k: int, count: int, labe
         shown = value - 1 > 2e-5
         value, error = (value - 1)[shown], error[shown]
         bars = np.stack([np.minimum(error, 0.9 * value), error])
-        axes.errorbar(grains[shown], value, bars, label=label, capsize=2, markersize=4, **STYLES[k % len(STYLES)])
+        axes.errorbar(
+            grains[shown],
+            value,
+            bars,
+            label=label,
+            capsize=2,
+            markersize=4,
+            **STYLES[k % len(STYLES)],
+        )
     else:
         largest = value[-1]
-        axes.errorbar(grains, value / largest, error / largest, label=label, capsize=2, markersize=4, **STYLES[k % 6])
+        axes.errorbar(
+            grains,
+            value / largest,
+            error / largest,
+            label=label,
+            capsize=2,
+            markersize=4,
+            **STYLES[k % 6],
+        )
 
 
 @styled
 def draw_waves(rows: list[dict]) -> Figure:
-    """Energy of the velocity across a wave vector and structure factor against wave number, in the largest cells."""
+    """Energy of the velocity across a wave vector and structure factor against wave number, in the
+    largest cells.
+    """
     largest = [row for row in rows if "spectrum" in row]
     chosen = [row for row in largest if flow_of(row) in WAVE_FLOWS] or largest
     figure = Figure(figsize=(TWO_COLUMNS, 2.9), layout="constrained")
@@ -91,11 +125,16 @@ def draw_waves(rows: list[dict]) -> Figure:
         style |= {"markersize": 3, "linewidth": 1, "label": flow_name(*flow_of(row))}
         for axes, name in zip(panels, ("transverse", "density"), strict=True):
             axes.plot(row["spectrum"]["wave_number"], row["spectrum"][name], **style)
-    labels = ("energy of velocity across $k$\nover that of equipartition", "structure factor $S(k)$")
+    labels = (
+        "energy of velocity across $k$\nover that of equipartition",
+        "structure factor $S(k)$",
+    )
     for axes, label in zip(panels, labels, strict=True):
         axes.set(xscale="log", yscale="log", xlabel=r"wave number $k$ ($1/\sigma$)", ylabel=label)
         axes.axhline(1, color="0.6", linewidth=0.8)
     label_log_axis(panels[1].yaxis)
     handles, names = panels[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=SMALL_SIZE, frameon=False)
+    figure.legend(
+        handles, names, loc="outside lower center", ncols=3, fontsize=SMALL_SIZE, frameon=False
+    )
     return figure

@@ -1,15 +1,17 @@
 """What are pressure, shear stress and temperatures of a large system, and how are they approached?
 
-Reads the flows of ``python -m benchmarks size_study`` and ``reference_map --part sizes`` with N ≥ 400. In two
-dimensions long waves of velocity with an energy ∝ k^(−β) make an average approach its limit as N^(−s), s = 1 − β/2, or
-grow as ln N if β = 2. First each flow with ν ≤ 0.7 has a limit and an amplitude of its own, and all share the exponent:
-χ² says which exponents the averages allow. Then all flows share one law of the missing part of an average,
+Reads the flows of ``python -m benchmarks size_study`` and ``reference_map --part sizes`` with N ≥
+400. In two dimensions long waves of velocity with an energy ∝ k^(−β) make an average approach its
+limit as N^(−s), s = 1 − β/2, or grow as ln N if β = 2. First each flow with ν ≤ 0.7 has a limit and
+an amplitude of its own, and all share the exponent: χ² says which exponents the averages allow.
+Then all flows share one law of the missing part of an average,
 
-    x(N) = x∞ [1 − (a + b (1 − α)) exp(m (ν − 0.5)) w(ν) (N/1600)^(−s)],        w = min(1, (ν_w − ν)/0.1),
+    x(N) = x∞ [1 − (a + b (1 − α)) exp(m (ν − 0.5)) w(ν) (N/1600)^(−s)],        w = min(1, (ν_w −
+    ν)/0.1),
 
-where w ends the waves towards jamming. A flow of 102,400 grains (``reference_map --part large``) is a test, not fitted.
-Standard errors are larger by the root of the reduced χ², as a profile of velocity that lasts longer than a sample
-is not in those of the flows.
+where w ends the waves towards jamming. A flow of 102,400 grains (``reference_map --part large``) is
+a test, not fitted. Standard errors are larger by the root of the reduced χ², as a profile of
+velocity that lasts longer than a sample is not in those of the flows.
 
     python -m benchmarks size_limits   # a second
 """
@@ -62,11 +64,21 @@ def run(output: Output) -> None:
         flows = flows_of(rows, average)
         loose = [flow for flow in flows if flow.packing_fraction <= LARGEST_FRACTION]
         laws[average] = {"exponents": exponents(loose), "law": law_of(flows)}
-        tests.append({"average": average, **compared_with_larger(large, flows, average, laws[average])})
-        limits += [{"average": average, **one} for one in limits_of(loose, laws[average]["exponents"]["interval"])]
+        tests.append(
+            {"average": average, **compared_with_larger(large, flows, average, laws[average])}
+        )
+        limits += [
+            {"average": average, **one}
+            for one in limits_of(loose, laws[average]["exponents"]["interval"])
+        ]
         print(average, rounded(laws[average], 4))
         print(rounded(tests[-1], 4))
-    output.write_rows("size_limits", {"laws": rounded(laws, 5), "tests": rounded(tests, 5)}, "rows", rounded(limits, 5))
+    output.write_rows(
+        "size_limits",
+        {"laws": rounded(laws, 5), "tests": rounded(tests, 5)},
+        "rows",
+        rounded(limits, 5),
+    )
 
 
 def rows_of_maps(*names: str) -> list[dict[str, Any]]:
@@ -79,7 +91,9 @@ def rows_of_maps(*names: str) -> list[dict[str, Any]]:
         for one in frame.to_dict("records"):
             row = {axis: one[axis] for axis in ("restitution", "packing_fraction", "grains")}
             rows.append(
-                row | {x: [one[x], one[f"{x}_stderr"]] for x in AVERAGES} | {"source": name.removeprefix("sizes_")}
+                row
+                | {x: [one[x], one[f"{x}_stderr"]] for x in AVERAGES}
+                | {"source": name.removeprefix("sizes_")}
             )
     return rows
 
@@ -102,13 +116,17 @@ def fitted(flow: Flow, shape: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def exponents(flows: list[Flow]) -> dict[str, Any]:
-    """χ² of the three laws and of the best exponent that all flows share, with its 95 % interval."""
+    """χ² of the three laws and of the best exponent that all flows share, with its 95 %
+    interval.
+    """
 
     def total(s: float) -> float:
         return sum(fitted(flow, flow.grains**-s)[3] for flow in flows)
 
     freedom = sum(len(flow.grains) - 2 for flow in flows)
-    chi_squared = {name: sum(fitted(flow, law(flow.grains))[3] for flow in flows) for name, law in LAWS.items()}
+    chi_squared = {
+        name: sum(fitted(flow, law(flow.grains))[3] for flow in flows) for name, law in LAWS.items()
+    }
     best = minimize_scalar(total, bounds=(EXPONENTS[0], EXPONENTS[-1]), method="bounded")
     scale = max(1.0, best.fun / (freedom - 1))
     allowed = EXPONENTS[np.array([total(s) for s in EXPONENTS]) < best.fun + 3.84 * scale]
@@ -116,14 +134,18 @@ def exponents(flows: list[Flow]) -> dict[str, Any]:
         "flows": len(flows),
         "freedom": freedom,
         "chi_squared": chi_squared,
-        "probability": {name: float(chi2.sf(x / scale, freedom)) for name, x in chi_squared.items()},
+        "probability": {
+            name: float(chi2.sf(x / scale, freedom)) for name, x in chi_squared.items()
+        },
         "best": [best.x, best.fun],
         "interval": [allowed[0], allowed[-1]],
     }
 
 
 def limits_of(flows: list[Flow], interval: list[float]) -> list[dict[str, Any]]:
-    """For each flow the limit by the exponents at both ends of their interval, and the 95 % interval of both."""
+    """For each flow the limit by the exponents at both ends of their interval, and the 95 %
+    interval of both.
+    """
     found = []
     for flow in flows:
         ends = [fitted(flow, flow.grains**-s) for s in interval]
@@ -141,16 +163,20 @@ def limits_of(flows: list[Flow], interval: list[float]) -> list[dict[str, Any]]:
     return found
 
 
-def compared_with_larger(row: dict[str, Any], flows: list[Flow], average: str, laws: dict[str, Any]) -> dict[str, Any]:
-    """What a flow with more grains than were fitted has over the largest fitted one, measured, and by both laws.
+def compared_with_larger(
+    row: dict[str, Any], flows: list[Flow], average: str, laws: dict[str, Any]
+) -> dict[str, Any]:
+    """What a flow with more grains than were fitted has over the largest fitted one, measured, and
+    by both laws.
 
-    Every pair is a ratio less one and its standard error; that of the exponent is of the limit and amplitude of the
-    flow alone, at both ends of the interval of the exponent.
+    Every pair is a ratio less one and its standard error; that of the exponent is of the limit and
+    amplitude of the flow alone, at both ends of the interval of the exponent.
     """
     flow = next(
         flow
         for flow in flows
-        if [flow.restitution, flow.packing_fraction] == [row["restitution"], row["packing_fraction"]]
+        if [flow.restitution, flow.packing_fraction]
+        == [row["restitution"], row["packing_fraction"]]
         and flow.source == "loose"
     )
     value, error = row[average]
@@ -162,7 +188,9 @@ def compared_with_larger(row: dict[str, Any], flows: list[Flow], average: str, l
         limit, amplitude, *_ = fitted(flow, flow.grains**-s)
         large, largest = limit - amplitude * grains**-s
         ends.append(large / largest - 1)
-    large, largest = 1 - SizeLaw(*laws["law"]["constants"]).missing(flow.restitution, flow.packing_fraction, grains)
+    large, largest = 1 - SizeLaw(*laws["law"]["constants"]).missing(
+        flow.restitution, flow.packing_fraction, grains
+    )
     return {
         "grains": [int(n) for n in grains],
         "measured": [ratio - 1, spread],
@@ -177,7 +205,9 @@ def missing_part(constants: np.ndarray, flow: Flow) -> np.ndarray:
 
 
 def law_of(flows: list[Flow]) -> dict[str, Any]:
-    """The constants of the law that all flows share, their standard errors and correlations, and χ²."""
+    """The constants of the law that all flows share, their standard errors and correlations, and
+    χ².
+    """
 
     def residuals(constants: np.ndarray) -> np.ndarray:
         found = []
@@ -189,7 +219,9 @@ def law_of(flows: list[Flow]) -> dict[str, Any]:
 
     lowest, highest = (0.05, 0, 0, -3, 0.76), (1.5, 1, 2, 10, 0.9)
     starts = [(s, *START[1:]) for s in (0.15, 0.4, 0.7)]
-    fits = [least_squares(residuals, start, bounds=(lowest, highest), x_scale="jac") for start in starts]
+    fits = [
+        least_squares(residuals, start, bounds=(lowest, highest), x_scale="jac") for start in starts
+    ]
     best = min(fits, key=lambda one: one.cost)
     freedom = best.fun.size - len(flows) - best.x.size
     covariance = np.linalg.pinv(best.jac.T @ best.jac) * max(1.0, 2 * best.cost / freedom)
@@ -205,11 +237,15 @@ def law_of(flows: list[Flow]) -> dict[str, Any]:
 
 
 def within(constants: np.ndarray, flow: Flow) -> np.ndarray:
-    """Whether the value at each N over that at the largest is what the law says, within 95 % intervals.
+    """Whether the value at each N over that at the largest is what the law says, within 95 %
+    intervals.
 
-    The interval is that of both standard errors and of the spread that ``sampling.budget`` adds to the law.
+    The interval is that of both standard errors and of the spread that ``sampling.budget`` adds to
+    the law.
     """
     missing, relative = missing_part(constants, flow), flow.stderrs / flow.values
     apart = np.log(flow.values / flow.values[-1]) - np.log1p(-missing) + np.log1p(-missing[-1])
-    half = np.hypot(HALF_INTERVAL * np.hypot(relative, relative[-1]), SIZE_SPREAD * (missing - missing[-1]))
+    half = np.hypot(
+        HALF_INTERVAL * np.hypot(relative, relative[-1]), SIZE_SPREAD * (missing - missing[-1])
+    )
     return (abs(apart) < half)[:-1]

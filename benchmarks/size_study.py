@@ -1,13 +1,15 @@
-"""What the number of grains does to stresses, temperature and force ratio, from 64 grains to 100,000.
+"""What the number of grains does to stresses, temperature and force ratio, from 64 grains to
+100,000.
 
-Twelve flows at dt = 1e-3 / shear rate, midpoint rule. For each the study measures, against N: stresses, granular
-temperature, local granular temperature, force ratio and collision rate, with errors; how the kinetic energy divides
-over wavelengths; the structure factor and the scatter of the density at long wavelengths; how long the flow remembers;
-and, in the largest flow, profiles along the velocity gradient.
+Twelve flows at dt = 1e-3 / shear rate, midpoint rule. For each the study measures, against N:
+stresses, granular temperature, local granular temperature, force ratio and collision rate, with
+errors; how the kinetic energy divides over wavelengths; the structure factor and the scatter of the
+density at long wavelengths; how long the flow remembers; and, in the largest flow, profiles along
+the velocity gradient.
 
-Before its sample a flow is sheared over ``PREPARED`` memories, and the sample lasts ``SAMPLED`` memories. The memory is
-max(nT/τ, 0.35 L √(ρ/p)), with the values of the next smaller N. Every flow that is done is kept in a folder, so a
-study that was stopped goes on where it was.
+Before its sample a flow is sheared over ``PREPARED`` memories, and the sample lasts ``SAMPLED``
+memories. The memory is max(nT/τ, 0.35 L √(ρ/p)), with the values of the next smaller N. Every flow
+that is done is kept in a folder, so a study that was stopped goes on where it was.
 
     python -m benchmarks size_study                   # 3 hours on two cores
     python -m benchmarks size_study --largest 25600   # an hour
@@ -43,7 +45,9 @@ PROFILE_BINS = 40
 
 
 class Plan(NamedTuple):
-    """Restitution and packing fraction of the flows, their largest N, and N with the number of seeds."""
+    """Restitution and packing fraction of the flows, their largest N, and N with the number of
+    seeds.
+    """
 
     flows: tuple[tuple[float, float, int], ...]
     seeds: dict[int, int]
@@ -70,15 +74,24 @@ QUICK = Plan(((0.5, 0.6, 256), (0.8, 0.2, 256)), {64: 2, 256: 1})
 
 
 def measured_flow(plan: Plan, flow: int, grains: int, folder: Path) -> tuple[int, int]:
-    """Measure one flow with all its seeds and keep the result in the folder; returns the number of the flow and N."""
+    """Measure one flow with all its seeds and keep the result in the folder; returns the number of
+    the flow and N.
+    """
     alpha, nu, _ = plan.flows[flow]
     start = time.perf_counter()
     memory = expected_memory(plan, flow, grains, folder)
     before, strain = max(PREPARED * memory, LEAST_STRAIN), max(SAMPLED * memory, LEAST_STRAIN)
     setting = jg.ShearFlow(grains=grains, restitution=alpha, packing_fraction=nu, timestep=1e-3)
-    seeds = [one_seed(setting, before, strain, 100 * flow + seed) for seed in range(plan.seeds[grains])]
+    seeds = [
+        one_seed(setting, before, strain, 100 * flow + seed) for seed in range(plan.seeds[grains])
+    ]
     arrays = {name: np.stack([seed[name] for seed in seeds]) for name in seeds[0]}
-    numbers = {"memory": memory, "before": before, "strain": strain, "seconds": time.perf_counter() - start}
+    numbers = {
+        "memory": memory,
+        "before": before,
+        "strain": strain,
+        "seconds": time.perf_counter() - start,
+    }
     folder.mkdir(parents=True, exist_ok=True)
     unfinished = kept_file(folder, alpha, nu, grains).with_suffix(".part")
     with unfinished.open("wb") as file:
@@ -88,7 +101,9 @@ def measured_flow(plan: Plan, flow: int, grains: int, folder: Path) -> tuple[int
 
 
 def one_seed(flow: jg.ShearFlow, before: float, strain: float, seed: int) -> dict[str, np.ndarray]:
-    """Prepare and sample one flow: the sums of its blocks, and the structure of the state after each block."""
+    """Prepare and sample one flow: the sums of its blocks, and the structure of the state after
+    each block.
+    """
     state = jg.prepare(flow, jax.random.key(seed), equilibrate=before)
     tallies, structures = [], []
     for _ in range(BLOCKS):
@@ -101,19 +116,23 @@ def one_seed(flow: jg.ShearFlow, before: float, strain: float, seed: int) -> dic
 
 
 def structure(state: jg.State) -> dict[str, np.ndarray]:
-    """Velocity and density of one instant by wave number, the amplitudes of the longest waves, and profiles along y.
+    """Velocity and density of one instant by wave number, the amplitudes of the longest waves, and
+    profiles along y.
 
-    ==========  ============  ==============================================================================
+    ==========  ============  ======================================================================
     name        shape         meaning
-    ==========  ============  ==============================================================================
+    ==========  ============  ======================================================================
     waves       (bins,)       number of waves in each bin of wave number
-    transverse  (bins,)       sum of their granular temperatures, of the velocity across the wave vector
+    transverse  (bins,)       sum of their granular temperatures, of the velocity across the wave
+                              vector
     along       (bins,)       the same for the velocity along the wave vector
     density     (bins,)       sum of their structure factors
-    amplitudes  (4, 3)        Σ m c_x e^{ikr}, Σ m c_y e^{ikr} and Σ e^{ikr} of the longest waves, over √(Σ m), √N
+    amplitudes  (4, 3)        Σ m c_x e^{ikr}, Σ m c_y e^{ikr} and Σ e^{ikr} of the longest waves,
+                              over √(Σ m), √N
     scatter     ()            variance over mean of the number of grains in boxes of about 25
-    profile     (4, bins)     number, mass, momentum along x and Σ m c² of the grains in equal layers of y
-    ==========  ============  ==============================================================================
+    profile     (4, bins)     number, mass, momentum along x and Σ m c² of the grains in equal
+                              layers of y
+    ==========  ============  ======================================================================
     """
     positions, velocities = np.asarray(state.positions), np.asarray(state.velocities)
     masses, side, tilt = np.asarray(state.grains.masses), float(state.side), float(state.tilt)
@@ -122,13 +141,19 @@ def structure(state: jg.State) -> dict[str, np.ndarray]:
     inside = np.stack([(positions[:, 0] / side - tilt * row) % 1, row], axis=1)
 
     across = max(4, round(side / 2))
-    cells = np.ravel_multi_index(tuple(np.minimum(inside * across, across - 1).astype(int).T), (across, across))
+    cells = np.ravel_multi_index(
+        tuple(np.minimum(inside * across, across - 1).astype(int).T), (across, across)
+    )
 
     def transformed(weights: np.ndarray) -> np.ndarray:
         return np.fft.fft2(np.bincount(cells, weights, across**2).reshape(across, across))
 
     momenta = masses[:, None] * velocities
-    jx, jy, density = transformed(momenta[:, 0]), transformed(momenta[:, 1]), transformed(np.ones(count))
+    jx, jy, density = (
+        transformed(momenta[:, 0]),
+        transformed(momenta[:, 1]),
+        transformed(np.ones(count)),
+    )
     numbers = np.fft.fftfreq(across, 1 / across)
     kx = 2 * np.pi / side * np.broadcast_to(numbers[:, None], jx.shape)
     ky = 2 * np.pi / side * (numbers[None, :] - tilt * numbers[:, None])
@@ -143,18 +168,28 @@ def structure(state: jg.State) -> dict[str, np.ndarray]:
         "along": np.abs((kx * jx + ky * jy) / k) ** 2 / mass,
         "density": np.abs(density) ** 2 / count,
     }
-    binned = {name: np.bincount(bins[keep], part.ravel()[keep], len(WAVE_BINS) - 1) for name, part in parts.items()}
+    binned = {
+        name: np.bincount(bins[keep], part.ravel()[keep], len(WAVE_BINS) - 1)
+        for name, part in parts.items()
+    }
 
     phases = np.exp(-2j * np.pi * np.asarray(WAVES) @ inside.T)
     amplitudes = np.stack(
-        [phases @ momenta[:, 0] / mass**0.5, phases @ momenta[:, 1] / mass**0.5, phases.sum(axis=1) / count**0.5], 1
+        [
+            phases @ momenta[:, 0] / mass**0.5,
+            phases @ momenta[:, 1] / mass**0.5,
+            phases.sum(axis=1) / count**0.5,
+        ],
+        1,
     )
     boxes = boxes_across(count)
     place = np.minimum(inside * boxes, boxes - 1).astype(int)
     number = np.bincount(place[:, 0] * boxes + place[:, 1], minlength=boxes**2)
     layer = np.minimum(row * PROFILE_BINS, PROFILE_BINS - 1).astype(int)
     energy = masses * np.sum(velocities**2, axis=1)
-    profile = [np.bincount(layer, x, PROFILE_BINS) for x in (np.ones(count), masses, momenta[:, 0], energy)]
+    profile = [
+        np.bincount(layer, x, PROFILE_BINS) for x in (np.ones(count), masses, momenta[:, 0], energy)
+    ]
     return {
         **binned,
         "amplitudes": amplitudes,
@@ -164,7 +199,9 @@ def structure(state: jg.State) -> dict[str, np.ndarray]:
 
 
 def expected_memory(plan: Plan, flow: int, grains: int, folder: Path) -> float:
-    """Strain that a flow remembers, from the values of the next smaller N that is done, or of kinetic theory."""
+    """Strain that a flow remembers, from the values of the next smaller N that is done, or of
+    kinetic theory.
+    """
     alpha, nu, _ = plan.flows[flow]
     smaller = [n for n in plan.seeds if n < grains and kept_file(folder, alpha, nu, n).exists()]
     if not smaller:
@@ -176,7 +213,9 @@ def expected_memory(plan: Plan, flow: int, grains: int, folder: Path) -> float:
 
 
 def memory_of(averages: Mapping[str, np.ndarray], nu: float, grains: int, area: float) -> float:
-    """Strain that a flow of discs of mass d² remembers; their mass is 4/π of the area that they fill."""
+    """Strain that a flow of discs of mass d² remembers; their mass is 4/π of the area that they
+    fill.
+    """
     return float(flow_correlation_strain(averages, grains, 4 / np.pi * nu * area, area, 1.0))
 
 
@@ -199,8 +238,14 @@ def sample_of(row: dict[str, np.ndarray], grains: int) -> Sample:
 
 def measure(plan: Plan, folder: Path, largest: int) -> None:
     """Measure all flows that are not yet done, the smaller N of a flow first, on all cores."""
-    sizes = {k: [n for n in plan.seeds if n <= min(most, largest)] for k, (_, _, most) in enumerate(plan.flows)}
-    left = {k: [n for n in ns if not kept_file(folder, *plan.flows[k][:2], n).exists()] for k, ns in sizes.items()}
+    sizes = {
+        k: [n for n in plan.seeds if n <= min(most, largest)]
+        for k, (_, _, most) in enumerate(plan.flows)
+    }
+    left = {
+        k: [n for n in ns if not kept_file(folder, *plan.flows[k][:2], n).exists()]
+        for k, ns in sizes.items()
+    }
     total = sum(map(len, left.values()))
     with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
         running: set = set()
@@ -220,7 +265,8 @@ def measure(plan: Plan, folder: Path, largest: int) -> None:
                 seconds = float(read_flow(folder, *plan.flows[k][:2], grains)["seconds"])
                 alpha, nu, _ = plan.flows[k]
                 print(
-                    f"{done} of {total}: restitution {alpha:g}, packing fraction {nu:g}, {grains} grains, "
+                    f"{done} of {total}: restitution {alpha:g}, packing fraction {nu:g}, {grains} "
+                    "grains, "
                     f"{seconds:.0f} s",
                     flush=True,
                 )
@@ -236,17 +282,27 @@ RESULTS = (
     "collision_rate",
     "macroscopic_friction",
 )
-SERIES = ("granular_temperature", "pressure", "shear_stress")  # whose correlation is compared with the memory
+SERIES = (
+    "granular_temperature",
+    "pressure",
+    "shear_stress",
+)  # whose correlation is compared with the memory
 
 
 def result(plan: Plan, flow: int, grains: int, folder: Path) -> dict:
-    """The row of one flow and N: values with standard errors, memory, and what the structure of its states says."""
+    """The row of one flow and N: values with standard errors, memory, and what the structure of its
+    states says.
+    """
     alpha, nu, _ = plan.flows[flow]
     row = read_flow(folder, alpha, nu, grains)
     batch = sample_of(row, grains)
     seeds = [jax.tree.map(lambda x, k=k: x[k], batch) for k in range(len(row["area"]))]
     values, errors = estimates(seeds)
-    measured = {f"correlation_{name}": float(x) for name, x in correlation_strains(seeds).items() if name in SERIES}
+    measured = {
+        f"correlation_{name}": float(x)
+        for name, x in correlation_strains(seeds).items()
+        if name in SERIES
+    }
     number = {"restitution": alpha, "packing_fraction": nu, "grains": grains, "seeds": len(seeds)}
     numbers = {name: float(row[name]) for name in ("before", "strain", "seconds")}
     found = {name: [float(values[name]), float(errors[name])] for name in RESULTS}
@@ -263,20 +319,24 @@ def result(plan: Plan, flow: int, grains: int, folder: Path) -> dict:
 def structure_result(row: dict[str, np.ndarray], grains: int) -> dict[str, float]:
     """What the states of a flow say of long waves of density and velocity.
 
-    ==================  ======================================================================================
+    ==================  ============================================================================
     name                meaning
-    ==================  ======================================================================================
+    ==================  ============================================================================
     structure_factor    mean structure factor of the four longest waves
     scatter             variance over mean of the number of grains in boxes of about 25
     wave_temperature    granular temperature that stands in waves longer than the boxes
-    profile_temperature granular temperature of the mean profile of c_x along y, over the whole sample
-    lasting_velocity    share of the energy of the longest wave along y that has a constant phase, for c_x
+    profile_temperature granular temperature of the mean profile of c_x along y, over the whole
+                        sample
+    lasting_velocity    share of the energy of the longest wave along y that has a constant phase,
+                        for c_x
     lasting_density     the same for the density
-    ==================  ======================================================================================
+    ==================  ============================================================================
     """
     amplitudes = row["amplitudes"]  # (seeds, blocks, waves, 3)
     along_y = amplitudes[:, :, 1]
-    lasting = np.abs(along_y.mean(axis=1)) ** 2 / np.mean(np.abs(along_y) ** 2, axis=1)  # (seeds, 3)
+    lasting = np.abs(along_y.mean(axis=1)) ** 2 / np.mean(
+        np.abs(along_y) ** 2, axis=1
+    )  # (seeds, 3)
     box = np.sqrt(BOX_GRAINS * row["area"][0] / grains)
     longer = WAVE_BINS[1:] < 2 * np.pi / box
     waves = (row["transverse"] + row["along"]).mean(axis=(0, 1))
@@ -293,21 +353,31 @@ def structure_result(row: dict[str, np.ndarray], grains: int) -> dict[str, float
 
 
 def spectrum(row: dict[str, np.ndarray], grains: int) -> dict[str, list[float]]:
-    """Energy of a wave of the velocity across its wave vector over equipartition, and structure factor, by wave number.
+    """Energy of a wave of the velocity across its wave vector over equipartition, and structure
+    factor, by wave number.
 
     Bins without a wave are left out.
     """
     waves = row["waves"].mean(axis=(0, 1))
     present = waves > 0
-    temperature = row["tally_kinetic_moment"].sum(axis=(0, 1)).trace() / 2 / row["tally_duration"].sum() / grains
-    transverse, density = (row[name].mean(axis=(0, 1))[present] / waves[present] for name in ("transverse", "density"))
+    temperature = (
+        row["tally_kinetic_moment"].sum(axis=(0, 1)).trace()
+        / 2
+        / row["tally_duration"].sum()
+        / grains
+    )
+    transverse, density = (
+        row[name].mean(axis=(0, 1))[present] / waves[present] for name in ("transverse", "density")
+    )
     middle = np.sqrt(WAVE_BINS[1:] * WAVE_BINS[:-1])[present]
     series = {"wave_number": middle, "transverse": transverse / temperature, "density": density}
     return {name: rounded(values.tolist(), 4) for name, values in series.items()}
 
 
 def run(output: Output, largest: int = 100_000, folder: Path = KEPT) -> None:
-    """Measure what is not yet done, and write ``size_study`` as JSON, and figures of values and waves."""
+    """Measure what is not yet done, and write ``size_study`` as JSON, and figures of values and
+    waves.
+    """
     plan = QUICK if output.quick else FULL
     folder = folder.with_name(f"{folder.name}_quick") if output.quick else folder
     measure(plan, folder, largest)
@@ -322,7 +392,12 @@ def run(output: Output, largest: int = 100_000, folder: Path = KEPT) -> None:
         if n == dict(done)[k]:  # the last one of a flow is its largest
             row["spectrum"] = spectrum(read_flow(folder, *plan.flows[k][:2], n), n)
     print_table(rows)
-    head = {"prepared_memories": PREPARED, "sampled_memories": SAMPLED, "blocks": BLOCKS, "timestep": 1e-3}
+    head = {
+        "prepared_memories": PREPARED,
+        "sampled_memories": SAMPLED,
+        "blocks": BLOCKS,
+        "timestep": 1e-3,
+    }
     output.write_rows("size_study", head, "flows", rows)
     output.write_picture(draw_sizes(rows), "size_study")
     output.write_picture(draw_waves(rows), "size_study", "_waves.png")
@@ -330,8 +405,17 @@ def run(output: Output, largest: int = 100_000, folder: Path = KEPT) -> None:
 
 def print_table(rows: list[dict]) -> None:
     """Values with standard errors, a line for each flow and N."""
-    names = ("pressure", "shear_stress", "granular_temperature", "local_granular_temperature", "force_ratio")
+    names = (
+        "pressure",
+        "shear_stress",
+        "granular_temperature",
+        "local_granular_temperature",
+        "force_ratio",
+    )
     print("    α     ν       N  memory  " + "  ".join(f"{name[:18]:>18}" for name in names))
     for row in rows:
         cells = "  ".join(f"{row[name][0]:9.4g} ± {row[name][1]:6.2g}" for name in names)
-        print(f"{row['restitution']:5g} {row['packing_fraction']:5g} {row['grains']:7d} {row['memory']:7.2f}  {cells}")
+        print(
+            f"{row['restitution']:5g} {row['packing_fraction']:5g} {row['grains']:7d} "
+            f"{row['memory']:7.2f}  {cells}"
+        )

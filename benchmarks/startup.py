@@ -1,7 +1,7 @@
 """How long does a command take, from the prompt to its end?
 
-Every command runs in its own process, with a cache folder of this benchmark: once with nothing in it, and then five
-times more, of which the median is taken.
+Every command runs in its own process, with a cache folder of this benchmark: once with nothing in
+it, and then five times more, of which the median is taken.
 
     python -m benchmarks startup            # 3 minutes on two cores
     python -m benchmarks startup --quick    # two runs of each command, and no map
@@ -23,11 +23,30 @@ MAP = "map.nc"
 COMMANDS = {
     "help": ["--help"],
     "info": ["info"],
-    "run, strain 0.5": ["run", "--restitution", "0.5", "--packing-fraction", "0.7", "--strain", "0.5", "--quiet"],
+    "run, strain 0.5": [
+        "run",
+        "--restitution",
+        "0.5",
+        "--packing-fraction",
+        "0.7",
+        "--strain",
+        "0.5",
+        "--quiet",
+    ],
     "map, quick preset": ["map", "--output", MAP, "--quiet"],
     "plot": ["plot", MAP],
 }
-SMALL_MAP = ["map", "--restitution", "0.3,0.7", "--packing-fraction", "0.5,0.6", "--grains", "32", "--output", MAP]
+SMALL_MAP = [
+    "map",
+    "--restitution",
+    "0.3,0.7",
+    "--packing-fraction",
+    "0.5,0.6",
+    "--grains",
+    "32",
+    "--output",
+    MAP,
+]
 _SAMPLE = """
 import time, statistics, jax
 jax.config.update("jax_enable_x64", True)
@@ -35,7 +54,10 @@ import jaxgran as jg
 flow = jg.ShearFlow(grains=16, restitution=0.5, packing_fraction=0.3, timestep=1e-3)
 state = jg.heated(flow, jax.random.key(0))
 compiled = jax.jit(jg.sample)
-calls = [lambda: jg.sample(flow, state, 0.032), lambda: jax.block_until_ready(compiled(flow, state, 0.032))]
+calls = [
+    lambda: jg.sample(flow, state, 0.032),
+    lambda: jax.block_until_ready(compiled(flow, state, 0.032)),
+]
 seconds = [[], []]  # in turn: of the call, and of what it has compiled
 for _ in range(210):
     for call, found in zip(calls, seconds):
@@ -56,10 +78,22 @@ def run(output: Output) -> None:
                 words = [*SMALL_MAP, "--quiet"]
             first = seconds_of(words, folder)
             warm = [seconds_of(words, folder) for _ in range(2 if output.quick else RUNS)]
-            rows.append({"command": command, "first": first, "warm": statistics.median(warm), "warm_runs": warm})
+            rows.append(
+                {
+                    "command": command,
+                    "first": first,
+                    "warm": statistics.median(warm),
+                    "warm_runs": warm,
+                }
+            )
             print(f"{command:18} first {first:6.1f} s, then {rows[-1]['warm']:6.2f} s", flush=True)
-        sample, compiled = map(float, process([sys.executable, "-c", _SAMPLE], folder).stdout.split())
-    print(f"jg.sample of one step in each of 32 blocks: {sample:.2g} ms, of which {sample - compiled:.2g} ms Python")
+        sample, compiled = map(
+            float, process([sys.executable, "-c", _SAMPLE], folder).stdout.split()
+        )
+    print(
+        f"jg.sample of one step in each of 32 blocks: {sample:.2g} ms, of which "
+        f"{sample - compiled:.2g} ms Python"
+    )
     milliseconds = {"sample_milliseconds": sample, "sample_python_milliseconds": sample - compiled}
     output.write_rows("startup", {"runs": RUNS} | milliseconds, "commands", rows)
 
@@ -69,7 +103,9 @@ def process(command: list[str], folder: Path) -> subprocess.CompletedProcess:
     environment = os.environ | {"XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": str(ROOT)}
     for name in ("JAX_ENABLE_X64", "JAX_COMPILATION_CACHE_DIR", "NUMBA_CACHE_DIR"):
         environment.pop(name, None)
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=True
+    )
 
 
 def seconds_of(words: list[str], folder: Path) -> float:

@@ -1,8 +1,9 @@
 """Time of a replica and step against the numba rival, from the same states, on one core.
 
-For every (restitution, packing fraction, dt) a flow is prepared once. Then jaxgran and the rival advance the same state
-by the same number of steps in turn, several times; the medians, their ratio and its geometric mean over the points are
-printed and written as JSON. Compilation is reported apart.
+For every (restitution, packing fraction, dt) a flow is prepared once. Then jaxgran and the rival
+advance the same state by the same number of steps in turn, several times; the medians, their ratio
+and its geometric mean over the points are printed and written as JSON. Compilation is reported
+apart.
 
     python -m benchmarks step_cost            # about 1 minute
     python -m benchmarks step_cost --quick    # half a minute
@@ -41,7 +42,10 @@ def run(output: Output, repeats: int = 7) -> None:
                 "{jaxgran_force_ratio:12.3f}{rival_force_ratio:8.3f}".format(**points[-1]),
                 flush=True,
             )
-    means = {dt: float(np.exp(np.mean([np.log(p["ratio"]) for p in points if p["dt"] == dt]))) for dt in STRAINS}
+    means = {
+        dt: float(np.exp(np.mean([np.log(p["ratio"]) for p in points if p["dt"] == dt])))
+        for dt in STRAINS
+    }
     for dt, mean in means.items():
         print(f"dt = {dt:g}: geometric mean of jaxgran over rival {mean:.2f}")
 
@@ -81,7 +85,14 @@ def compare(alpha: float, nu: float, dt: float, repeats: int) -> dict:
         if repeat:
             ours.append((middle - start) / steps * 1e6)
             theirs.append((end - middle) / steps * 1e6)
-            sums.append([float(tally.impulse), float(tally.binary_impulse), rival.impulse, rival.binary_impulse])
+            sums.append(
+                [
+                    float(tally.impulse),
+                    float(tally.binary_impulse),
+                    rival.impulse,
+                    rival.binary_impulse,
+                ]
+            )
     impulse, binary, rival_impulse, rival_binary = np.sum(sums, axis=0)
     return {
         "alpha": alpha,

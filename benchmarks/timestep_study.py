@@ -1,13 +1,14 @@
 """The force ratio against the time step, from 1e-2 to 1e-6, and its extrapolation to zero.
 
-Six flows, both activation rules, several seeds. Each seed reaches its steady state at dt = 1e-3; from there the coarser
-time steps are sampled, then the finer ones in turn, each after a strain of 0.5 in which the contact network forgets the
-one before. Steps without an approaching contact are jumped over, so that the finest step can be paid for.
+Six flows, both activation rules, several seeds. Each seed reaches its steady state at dt = 1e-3;
+from there the coarser time steps are sampled, then the finer ones in turn, each after a strain of
+0.5 in which the contact network forgets the one before. Steps without an approaching contact are
+jumped over, so that the finest step can be paid for.
 
-As dt → 0 both rules become the same law. So the excess of the force ratio over one is fitted, over the finer time steps
-of both, by L + A dt^β with one limit L and an amplitude and an exponent for each rule. The interval of L is where χ²
-exceeds its minimum by no more than its value per degree of freedom (at least one), joined over fits that take in one
-time step less and one more.
+As dt → 0 both rules become the same law. So the excess of the force ratio over one is fitted, over
+the finer time steps of both, by L + A dt^β with one limit L and an amplitude and an exponent for
+each rule. The interval of L is where χ² exceeds its minimum by no more than its value per degree of
+freedom (at least one), joined over fits that take in one time step less and one more.
 
     python -m benchmarks timestep_study           # about 23 minutes on two cores
     python -m benchmarks timestep_study --quick   # two flows down to 1e-4, under a minute
@@ -43,7 +44,9 @@ advance = jax.jit(jg.advance)
 
 
 class Plan(NamedTuple):
-    """Restitutions and packing fractions of the flows, grains, seeds, sampled strain of each, and the time steps."""
+    """Restitutions and packing fractions of the flows, grains, seeds, sampled strain of each, and
+    the time steps.
+    """
 
     restitution: tuple[float, ...]
     packing_fraction: tuple[float, ...]
@@ -63,20 +66,35 @@ QUICK = Plan((0.5, 0.1), (0.6,), 64, 3, 1.0, half_decades(-2, -4))
 
 
 def run(output: Output) -> None:
-    """Run the plan on all cores, print the extrapolations, and write ``timestep_study`` as JSON and PNG."""
+    """Run the plan on all cores, print the extrapolations, and write ``timestep_study`` as JSON and
+    PNG.
+    """
     plan = QUICK if output.quick else FULL
     flows = list(product(plan.packing_fraction, plan.restitution))
     tasks = [(*flow, rule, seed) for flow in flows for rule in RULES for seed in range(plan.seeds)]
     dear_first = sorted(tasks, key=lambda task: (-task[0], task[1]))
     start = time.perf_counter()
-    with ProcessPoolExecutor(min(usable_cores(), len(tasks)), multiprocessing.get_context("spawn")) as pool:
-        done = dict(zip(dear_first, pool.map(samples, [plan] * len(tasks), dear_first), strict=True))
+    with ProcessPoolExecutor(
+        min(usable_cores(), len(tasks)), multiprocessing.get_context("spawn")
+    ) as pool:
+        done = dict(
+            zip(dear_first, pool.map(samples, [plan] * len(tasks), dear_first), strict=True)
+        )
     results = []
     for nu, alpha in flows:
-        points = {rule: curve(plan, [done[nu, alpha, rule, seed] for seed in range(plan.seeds)]) for rule in RULES}
-        results.append({"packing_fraction": nu, "restitution": alpha, "points": points, **extrapolated(points)})
-        limit = "dt → 0: {best:.4g}, between {low:.4g} and {high:.4g}".format(**results[-1]["limit"])
-        exponents = ", ".join(f"{rule} {power:.2f}" for rule, power in results[-1]["exponents"].items())
+        points = {
+            rule: curve(plan, [done[nu, alpha, rule, seed] for seed in range(plan.seeds)])
+            for rule in RULES
+        }
+        results.append(
+            {"packing_fraction": nu, "restitution": alpha, "points": points, **extrapolated(points)}
+        )
+        limit = "dt → 0: {best:.4g}, between {low:.4g} and {high:.4g}".format(
+            **results[-1]["limit"]
+        )
+        exponents = ", ".join(
+            f"{rule} {power:.2f}" for rule, power in results[-1]["exponents"].items()
+        )
         print(f"ν {nu:g}, α {alpha:g}: {limit}; exponents: {exponents}")
     head = {"plan": plan._asdict(), "wall_seconds": time.perf_counter() - start}
     output.write_json("timestep_study", {**head, "flows": results})
@@ -90,7 +108,9 @@ def samples(plan: Plan, task: tuple[float, float, str, int]) -> dict[float, jg.S
     def flow(timestep: float) -> jg.ShearFlow:
         return jg.ShearFlow(plan.grains, alpha, nu, timestep, activation=rule)
 
-    steady = jg.prepare(flow(START), jax.random.key(seed), equilibrate=max(5.0, 2 / (nu * (1 - alpha**2))))
+    steady = jg.prepare(
+        flow(START), jax.random.key(seed), equilibrate=max(5.0, 2 / (nu * (1 - alpha**2)))
+    )
     found, state = {}, steady
     for timestep in sorted(plan.timesteps, reverse=True):
         before = steady if timestep >= START else state
@@ -101,7 +121,9 @@ def samples(plan: Plan, task: tuple[float, float, str, int]) -> dict[float, jg.S
 
 
 def curve(plan: Plan, seeds: list[dict[float, jg.Sample]]) -> list[dict]:
-    """Force ratio and pressure with their standard errors, and the status, of every time step, the finest first."""
+    """Force ratio and pressure with their standard errors, and the status, of every time step, the
+    finest first.
+    """
     points = []
     for timestep in sorted(plan.timesteps):
         value, error = estimates([seed[timestep] for seed in seeds])
@@ -126,27 +148,36 @@ def extrapolated(points: dict[str, list[dict]]) -> dict:
     tried = [n for n in (usual - 1, usual, usual + 1) if FEWEST_FITTED <= n <= length]
     fits = {n: joint_fit([tuple(values[:n] for values in one) for one in data]) for n in tried}
     (best, _, _), exponents = fits[usual]
-    low, high = min(limit[1] for limit, _ in fits.values()), max(limit[2] for limit, _ in fits.values())
+    low, high = (
+        min(limit[1] for limit, _ in fits.values()),
+        max(limit[2] for limit, _ in fits.values()),
+    )
     limit = {"best": 1 + best, "low": 1 + low, "high": 1 + high}
     return {"limit": limit, "exponents": dict(zip(RULES, exponents, strict=True)), "fitted": usual}
 
 
 def arrays(points: list[dict]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time steps, excess, and its error. Where hardly a cluster was seen the error is a third of that of the next
-    coarser step, as no scatter is no certainty."""
-    dt, ratio, error = (np.array([p[name] for p in points]) for name in ("timestep", "force_ratio", "stderr"))
+    """Time steps, excess, and its error. Where hardly a cluster was seen the error is a third of
+    that of the next coarser step, as no scatter is no certainty."""
+    dt, ratio, error = (
+        np.array([p[name] for p in points]) for name in ("timestep", "force_ratio", "stderr")
+    )
     for k in range(len(error) - 2, -1, -1):
         error[k] = max(error[k], error[k + 1] / 3)
     return dt, ratio - 1, error
 
 
 def joint_fit(data: list[tuple]) -> tuple[tuple[float, float, float], list[float]]:
-    """Limit of the excess, at least 0, with the ends of its interval, and the exponent of each curve."""
+    """Limit of the excess, at least 0, with the ends of its interval, and the exponent of each
+    curve.
+    """
     low, high = 0.0, max(min(excess[0] + 2 * error[0] for _, excess, error in data), 1e-9)
     freedom = max(1, sum(len(one[0]) for one in data) - 5)
     for _ in range(REFINEMENTS):
         limits = np.linspace(low, high, TRIED_LIMITS)
-        fits = [[power_law(dt, excess - limit, error) for dt, excess, error in data] for limit in limits]
+        fits = [
+            [power_law(dt, excess - limit, error) for dt, excess, error in data] for limit in limits
+        ]
         chi2 = np.array([sum(fit[0] for fit in pair) for pair in fits])
         inside = np.flatnonzero(chi2 <= chi2.min() + max(1.0, chi2.min() / freedom))
         low, high = limits[max(inside[0] - 1, 0)], limits[min(inside[-1] + 1, TRIED_LIMITS - 1)]
@@ -156,7 +187,9 @@ def joint_fit(data: list[tuple]) -> tuple[tuple[float, float, float], list[float
 
 
 def power_law(dt: np.ndarray, excess: np.ndarray, error: np.ndarray) -> tuple[float, float]:
-    """χ² and exponent β of the weighted least-squares fit A dt^β; A follows from β, which is searched."""
+    """χ² and exponent β of the weighted least-squares fit A dt^β; A follows from β, which is
+    searched.
+    """
     x = dt / dt.max()
 
     def chi2(exponent: float) -> float:
@@ -173,20 +206,32 @@ LEAST = 1e-5  # smallest excess that is drawn
 
 @styled
 def draw(flows: list[dict]) -> Figure:
-    """Excess of the force ratio against the time step, a panel for every packing fraction, with the limits."""
-    fractions, restitutions = (sorted({f[name] for f in flows}) for name in ("packing_fraction", "restitution"))
+    """Excess of the force ratio against the time step, a panel for every packing fraction, with the
+    limits.
+    """
+    fractions, restitutions = (
+        sorted({f[name] for f in flows}) for name in ("packing_fraction", "restitution")
+    )
     figure = Figure(figsize=(TWO_COLUMNS, 3.4), layout="constrained")
     panels = figure.subplots(1, len(fractions), sharey=True, squeeze=False)[0]
     for axes, nu in zip(panels, fractions, strict=True):
-        here = sorted((f for f in flows if f["packing_fraction"] == nu), key=lambda f: -f["restitution"])
+        here = sorted(
+            (f for f in flows if f["packing_fraction"] == nu), key=lambda f: -f["restitution"]
+        )
         for flow in here:
             k = restitutions.index(flow["restitution"])
-            style = {"color": ("black", "tab:blue", "tab:red")[k % 3], "marker": "osD"[k % 3], "markersize": 3.5}
+            style = {
+                "color": ("black", "tab:blue", "tab:red")[k % 3],
+                "marker": "osD"[k % 3],
+                "markersize": 3.5,
+            }
             for rule, points in flow["points"].items():
                 dt, excess, error = arrays(points)
                 shown = excess > LEAST
                 lower = np.minimum(error, excess - LEAST)
-                touching = {"linestyle": "--", "markerfacecolor": "white"} if rule == "touching" else {}
+                touching = (
+                    {"linestyle": "--", "markerfacecolor": "white"} if rule == "touching" else {}
+                )
                 axes.errorbar(
                     dt[shown],
                     excess[shown],
@@ -213,7 +258,9 @@ def draw(flows: list[dict]) -> Figure:
 
 
 def draw_limit(axes: Axes, limit: dict, place: float, style: dict) -> None:
-    """The interval of the limit as a bar, ending in an arrow where it reaches down to no excess; the best as a mark."""
+    """The interval of the limit as a bar, ending in an arrow where it reaches down to no excess;
+    the best as a mark.
+    """
     low, best, high = (max(limit[name] - 1, LEAST) for name in ("low", "best", "high"))
     axes.plot([place, place], [low, high], color=style["color"], linewidth=2.5)
     if low <= LEAST:

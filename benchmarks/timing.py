@@ -1,4 +1,6 @@
-"""How long a call takes: time of the processor, of this process, so that other work on the machine counts little."""
+"""How long a call takes: time of the processor, of this process, so that other work on the machine
+counts little.
+"""
 
 import time
 from collections.abc import Callable
@@ -6,12 +8,18 @@ from typing import TypeVar
 
 import numpy as np
 
-SHORTEST, MOST_CALLS, LONG = 2e-3, 200, 0.02  # seconds of a timing, calls in it, seconds of a call that is timed once
+SHORTEST, MOST_CALLS, LONG = (
+    2e-3,
+    200,
+    0.02,
+)  # seconds of a timing, calls in it, seconds of a call that is timed once
 Answer = TypeVar("Answer")
 
 
 def timed(call: Callable[[], Answer], timings: int = 3) -> tuple[float, Answer]:
-    """Seconds of a call and what it returned: of one if it is long, else the median of timings of many."""
+    """Seconds of a call and what it returned: of one if it is long, else the median of timings of
+    many.
+    """
     start = time.process_time()
     answer = call()
     once = time.process_time() - start

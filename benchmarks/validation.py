@@ -1,9 +1,10 @@
 """Stresses, temperature and force ratio against independent programs.
 
-Two maps are run. The first is compared with event-driven simulations of the same hard discs (N = 1000), which have no
-time step at all; the second, with the touching rule at dt = 1e-4, with values of contact dynamics (N = 400). Of both
-programs only averages are known. The figure shows the event-driven program of this repository instead of the first,
-from the result of ``contact_duration``, and is drawn by ``python -m benchmarks draw validation``.
+Two maps are run. The first is compared with event-driven simulations of the same hard discs (N =
+1000), which have no time step at all; the second, with the touching rule at dt = 1e-4, with values
+of contact dynamics (N = 400). Of both programs only averages are known. The figure shows the
+event-driven program of this repository instead of the first, from the result of
+``contact_duration``, and is drawn by ``python -m benchmarks draw validation``.
 
     python -m benchmarks validation           # about 2 minutes on two cores
     python -m benchmarks validation --quick   # fewer grains and less strain, about a minute
@@ -67,8 +68,16 @@ def run(output: Output) -> None:
         activation="touching",
         workers=workers,
     )
-    rows = [row for point, values in EVENT_DRIVEN.items() for row in compared(stresses, point, OBSERVABLES, values)]
-    rows += [row for point, value in FORCE_RATIO.items() for row in compared(ratios, point, ("force_ratio",), (value,))]
+    rows = [
+        row
+        for point, values in EVENT_DRIVEN.items()
+        for row in compared(stresses, point, OBSERVABLES, values)
+    ]
+    rows += [
+        row
+        for point, value in FORCE_RATIO.items()
+        for row in compared(ratios, point, ("force_ratio",), (value,))
+    ]
     print("    ν    α  observable              jaxgran              reference   difference")
     for row in rows:
         print(
@@ -82,7 +91,9 @@ def run(output: Output) -> None:
     output.write_json("validation", {"runs": attributes, "rows": rows})
 
 
-def compared(data: xr.Dataset, point: tuple[float, float], names: tuple[str, ...], references: tuple) -> list[dict]:
+def compared(
+    data: xr.Dataset, point: tuple[float, float], names: tuple[str, ...], references: tuple
+) -> list[dict]:
     here = data.sel(packing_fraction=point[0], restitution=point[1])
     meanings = data.status.attrs["flag_meanings"].split()
     values = list(np.asarray(data.status.attrs["flag_values"]))
@@ -107,7 +118,8 @@ def compared(data: xr.Dataset, point: tuple[float, float], names: tuple[str, ...
 
 @styled
 def draw(rows: list[dict], reference: list[dict]) -> Figure:
-    """Differences from other programs, with standard errors: stresses and temperature, and force ratios.
+    """Differences from other programs, with standard errors: stresses and temperature, and force
+    ratios.
 
     Args:
       rows: of this benchmark.
@@ -119,22 +131,35 @@ def draw(rows: list[dict], reference: list[dict]) -> Figure:
     for k, (name, label) in enumerate(zip(OBSERVABLES, ("$T$", "$p$", r"$\tau$"), strict=True)):
         quotients = []
         for flow in reference:
-            one = next(row for row in rows if [row["nu"], row["alpha"], row["observable"]] == [*flow["flow"], name])
+            one = next(
+                row
+                for row in rows
+                if [row["nu"], row["alpha"], row["observable"]] == [*flow["flow"], name]
+            )
             quotient = one["value"] / flow[name][0]
             noise = quotient * np.hypot(one["error"] / one["value"], flow[name][1] / flow[name][0])
             quotients.append((100 * (quotient - 1), 100 * noise))
         value, error = np.transpose(quotients)
-        style = {"color": ("black", "0.4", "tab:blue")[k], "marker": "os^"[k], "ls": "none", "label": label}
+        style = {
+            "color": ("black", "0.4", "tab:blue")[k],
+            "marker": "os^"[k],
+            "ls": "none",
+            "label": label,
+        }
         left.errorbar(value, place + 0.22 * (1 - k), xerr=error, **style)
     left.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    left.set_yticks(place, [rf"$\alpha={flow['flow'][1]:g}$, $\nu={flow['flow'][0]:g}$" for flow in reference])
+    left.set_yticks(
+        place, [rf"$\alpha={flow['flow'][1]:g}$, $\nu={flow['flow'][0]:g}$" for flow in reference]
+    )
     left.set(xlabel="jaxgran / event-driven discs − 1 (%)", ylim=(-0.6, len(reference) - 0.4))
     ratios = [row for row in rows if row["observable"] == "force_ratio"]
     place = np.arange(len(ratios))[::-1]
     uncertain = 100 * REFERENCE_ERROR
     right.axvspan(-uncertain, uncertain, color="0.9", label="error of the reference")
     noise = [100 * row["error"] / row["reference"] for row in ratios]
-    right.errorbar([row["percent"] for row in ratios], place, xerr=noise, fmt="ko", label="force ratio")
+    right.errorbar(
+        [row["percent"] for row in ratios], place, xerr=noise, fmt="ko", label="force ratio"
+    )
     right.set_yticks(place, [rf"$\alpha={row['alpha']:g}$, $\nu={row['nu']:g}$" for row in ratios])
     right.set(xlabel="jaxgran / contact dynamics − 1 (%)", ylim=(-0.6, len(ratios) - 0.4))
     right.legend(ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1.0))

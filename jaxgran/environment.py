@@ -1,4 +1,6 @@
-"""Software and hardware of this process: versions, commit, processor, cores, memory, devices, precision."""
+"""Software and hardware of this process: versions, commit, processor, cores, memory, devices,
+precision.
+"""
 
 import hashlib
 import os
@@ -34,7 +36,9 @@ def system() -> str:
 
 def processor() -> str:
     """The model of the processor, or "unknown"."""
-    names = [line.split(":", 1)[1].strip() for line in processor_lines() if line.startswith("model name")]
+    names = [
+        line.split(":", 1)[1].strip() for line in processor_lines() if line.startswith("model name")
+    ]
     return names[0] if names else platform.processor() or "unknown"
 
 
@@ -61,7 +65,9 @@ def usable_cores() -> int:
 
 
 def usable_threads() -> int:
-    """Number of threads for the replicas of a batch: ``NUMBA_NUM_THREADS``, or one for each usable core."""
+    """Number of threads for the replicas of a batch: ``NUMBA_NUM_THREADS``, or one for each usable
+    core.
+    """
     asked = os.environ.get("NUMBA_NUM_THREADS", "")
     return int(asked) if asked.isdigit() and int(asked) else usable_cores()
 
@@ -80,9 +86,14 @@ def devices() -> list[str]:
 
     try:
         return [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
-    except (RuntimeError, AssertionError) as failure:  # JAX asserts that a requested platform exists
+    except (
+        RuntimeError,
+        AssertionError,
+    ) as failure:  # JAX asserts that a requested platform exists
         message = " ".join(str(failure).split()).rstrip(".")
-        raise RuntimeError(message or f"JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS')} has none") from failure
+        raise RuntimeError(
+            message or f"JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS')} has none"
+        ) from failure
 
 
 def default_device() -> Any:

@@ -1,7 +1,7 @@
 """Atomic writes, file locks, and cache files with a checksum.
 
-A file is written under a temporary name in its final folder, synced, and renamed. A killed process leaves either the
-old file or the new one, never a part of one.
+A file is written under a temporary name in its final folder, synced, and renamed. A killed process
+leaves either the old file or the new one, never a part of one.
 """
 
 import hashlib
@@ -21,7 +21,8 @@ _DIGEST = 32  # bytes at the start of a cache file: the SHA-256 hash of the rest
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yield the path of a temporary file beside ``path``, which replaces ``path`` if the block succeeds.
+    """Yield the path of a temporary file beside ``path``, which replaces ``path`` if the block
+    succeeds.
 
     An OSError of the block names ``path``.
     """
@@ -41,7 +42,9 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def file_lock(path: Path) -> Iterator[None]:
-    """Let one process at a time enter the block for a file; the lock is released even if the process dies."""
+    """Let one process at a time enter the block for a file; the lock is released even if the
+    process dies.
+    """
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
     name = path.with_suffix(".lock")
@@ -54,7 +57,9 @@ def file_lock(path: Path) -> Iterator[None]:
         with lock:
             if fcntl is not None:
                 fcntl.flock(lock, fcntl.LOCK_EX)
-                if not same_file(lock.fileno(), name):  # its owner has removed it: lock the one that is there now
+                if not same_file(
+                    lock.fileno(), name
+                ):  # its owner has removed it: lock the one that is there now
                     continue
             try:
                 yield
@@ -65,7 +70,9 @@ def file_lock(path: Path) -> Iterator[None]:
 
 
 def same_file(handle: int, path: Path) -> bool:
-    """Whether an open file is the one that has this name now, and not one that was removed since."""
+    """Whether an open file is the one that has this name now, and not one that was removed
+    since.
+    """
     try:
         return os.path.samestat(os.fstat(handle), path.stat())
     except OSError:
@@ -82,7 +89,9 @@ def read_cached(path: Path) -> bytes | None:
 
 
 def other_version(name: str, found: object, version: int | str) -> str:
-    """A sentence if a file has another ``format_version`` than this version of jaxgran reads; "" if it has the same."""
+    """A sentence if a file has another ``format_version`` than this version of jaxgran reads; "" if
+    it has the same.
+    """
     if found == version:
         return ""
     has = "no format_version" if found is None else f"format_version {found}"
@@ -99,7 +108,9 @@ def write_cached(path: Path, content: bytes, most: int) -> None:
     with atomic_write(path) as temporary:
         temporary.write_bytes(hashlib.sha256(content).digest() + content)
     with suppress(OSError):
-        newest_first = sorted(path.parent.glob(f"*{path.suffix}"), key=lambda x: x.stat().st_mtime, reverse=True)
+        newest_first = sorted(
+            path.parent.glob(f"*{path.suffix}"), key=lambda x: x.stat().st_mtime, reverse=True
+        )
         for old in newest_first[most:]:
             old.unlink(missing_ok=True)
 

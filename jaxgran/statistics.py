@@ -1,8 +1,9 @@
-"""Standard errors of estimates from block sums, error correlations, statistical inefficiency, drift of a series.
+"""Standard errors of estimates from block sums, error correlations, statistical inefficiency, drift
+of a series.
 
-``standard_errors`` infers the correlation time from the blocks themselves; its intervals have the stated coverage when
-each seed is several correlation times long. ``jackknife`` assumes that merged blocks are independent, and
-underestimates errors when few merged blocks are.
+``standard_errors`` infers the correlation time from the blocks themselves; its intervals have the
+stated coverage when each seed is several correlation times long. ``jackknife`` assumes that merged
+blocks are independent, and underestimates errors when few merged blocks are.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,8 +13,17 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-BLOCK_MERGES = (1, 2, 4, 8, 16, 32)  # blocks per group; with 32 blocks per seed, the last compares whole seeds
-_FEWEST_GROUPS = 4  # the spread over fewer groups is too uncertain; single blocks are used in any case
+BLOCK_MERGES = (
+    1,
+    2,
+    4,
+    8,
+    16,
+    32,
+)  # blocks per group; with 32 blocks per seed, the last compares whole seeds
+_FEWEST_GROUPS = (
+    4  # the spread over fewer groups is too uncertain; single blocks are used in any case
+)
 _MOST_BLOCKS = 32  # per seed in ``standard_errors``; more are merged
 _TIMES = np.geomspace(0.2, 20, 12)  # correlation times, in blocks
 _WHITE_SHARES = np.array([0.0, 0.5, 0.9])  # share of white noise in the variance of a block
@@ -27,9 +37,11 @@ Estimates = dict[str, np.ndarray]
 
 
 class _Posterior(NamedTuple):
-    """Posterior of n means: a mixture of Student's t distributions, one for each of the (models,) of the correlation.
+    """Posterior of n means: a mixture of Student's t distributions, one for each of the (models,)
+    of the correlation.
 
-    ``weight``, ``shift`` (mean of a model minus the plain mean) and ``width`` (its scale) have shape (models, n).
+    ``weight``, ``shift`` (mean of a model minus the plain mean) and ``width`` (its scale) have
+    shape (models, n).
     """
 
     weight: np.ndarray
@@ -43,34 +55,38 @@ def standard_errors(
 ) -> tuple[Estimates, Estimates]:
     """Estimates from the sums over all blocks of all seeds, and their standard errors.
 
-    The error is the half-width of the 95 % interval divided by 1.96, so ±1.96 errors is a 95 % interval even if few
-    blocks are independent and Student's distribution is wide. The jackknife influence of each block makes a series,
-    modelled as a mean plus Gaussian noise with the correlation
+    The error is the half-width of the 95 % interval divided by 1.96, so ±1.96 errors is a 95 %
+    interval even if few blocks are independent and Student's distribution is wide. The jackknife
+    influence of each block makes a series, modelled as a mean plus Gaussian noise with the
+    correlation
 
         R_ij = (1 - w) exp(-|i - j| / t) + w δ_ij
 
-    within a seed and none between seeds: a first-order autoregressive process plus white noise. The correlation time
-    t, in blocks, and the share w of white noise are unknown. For given (t, w), with flat priors for the mean and for
-    ln σ, the mean has a Student's t distribution with M - 1 degrees of freedom for M blocks in all. Its centre is the
-    generalised least-squares mean μ = 1'R⁻¹x / 1'R⁻¹1, its scale S / √((M - 1) 1'R⁻¹1) with S² = (x - μ)'R⁻¹(x - μ),
-    and its weight |R|^(-1/2) (1'R⁻¹1)^(-1/2) S^(1 - M). The interval is that of the mixture over 12 correlation times
-    from 0.2 to 20 blocks and three values of w, around the plain mean. The prior is t^(1/4) / (1 + (t/2.5)²) in ln t
-    and flat in w.
+    within a seed and none between seeds: a first-order autoregressive process plus white noise. The
+      correlation time t, in blocks, and the share w of white noise are unknown. For given (t, w),
+      with flat priors for the mean and for ln σ, the mean has a Student's t distribution with M - 1
+      degrees of freedom for M blocks in all. Its centre is the generalised least-squares mean μ =
+      1'R⁻¹x / 1'R⁻¹1, its scale S / √((M - 1) 1'R⁻¹1) with S² = (x - μ)'R⁻¹(x - μ), and its weight
+      |R|^(-1/2) (1'R⁻¹1)^(-1/2) S^(1 - M). The interval is that of the mixture over 12 correlation
+      times from 0.2 to 20 blocks and three values of w, around the plain mean. The prior is t^(1/4)
+      / (1 + (t/2.5)²) in ln t and flat in w.
 
-    Blocks of shorter seeds are merged until they last about as long as those of the longest, so that one correlation
-    time holds for all, see ``merged_blocks``.
+    Blocks of shorter seeds are merged until they last about as long as those of the longest, so
+    that one correlation time holds for all, see ``merged_blocks``.
 
-    With 32 blocks per seed, intervals for sheared flows have their nominal coverage if a seed is at least eight
-    correlation strains long, and for most flows from four (``python -m benchmarks coverage``).
+    With 32 blocks per seed, intervals for sheared flows have their nominal coverage if a seed is at
+    least eight correlation strains long, and for most flows from four (``python -m benchmarks
+    coverage``).
 
     Args:
-      estimate: maps a pytree of sums with any leading axes to by_name estimates with the same leading axes.
+      estimate: maps a pytree of sums with any leading axes to by_name estimates with the same
+        leading axes.
       sums: pytree of arrays of shape (seeds, blocks, ...), in any units.
       lengths: (seeds,) durations in any unit; None where all are equal.
 
     Returns:
-      Estimates and standard errors, without the axes of seeds and blocks. The error is NaN where it cannot be known:
-      for fewer than two blocks, and where all blocks are equal.
+      Estimates and standard errors, without the axes of seeds and blocks. The error is NaN where it
+      cannot be known: for fewer than two blocks, and where all blocks are equal.
 
     Examples:
       Eight blocks with a trend. Independent blocks would have an error of 0.87.
@@ -87,9 +103,11 @@ def standard_errors(
 
 
 def merged_blocks(lengths: np.ndarray | None, seeds: int, blocks: int) -> np.ndarray:
-    """Numbers of blocks (seeds,) that last about as long as those of the longest seed, at most ``blocks``.
+    """Numbers of blocks (seeds,) that last about as long as those of the longest seed, at most
+    ``blocks``.
 
-    Where a seed is 1/n of the longest, n of its blocks are one. Seeds of up to 1.5 times the length count as equal.
+    Where a seed is 1/n of the longest, n of its blocks are one. Seeds of up to 1.5 times the length
+    count as equal.
 
     Examples:
       >>> merged_blocks(np.array([8.0, 32.0, 9.0]), 3, 32).tolist()
@@ -104,7 +122,8 @@ def merged_blocks(lengths: np.ndarray | None, seeds: int, blocks: int) -> np.nda
 def error_correlation(
     estimate: Callable[[Any], Mapping[str, Any]], sums: Any, lengths: np.ndarray | None = None
 ) -> np.ndarray:
-    """Correlation matrix (n, n) of the errors of n scalar estimates, from the influences of the blocks.
+    """Correlation matrix (n, n) of the errors of n scalar estimates, from the influences of the
+    blocks.
 
     Args:
       estimate, sums, lengths: as in ``standard_errors``.
@@ -119,22 +138,28 @@ def error_correlation(
     return unit.T @ unit
 
 
-def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[Estimates, Estimates]:
+def jackknife(
+    estimate: Callable[[Any], Mapping[str, Any]], sums: Any
+) -> tuple[Estimates, Estimates]:
     """Estimates from the sums over all blocks of all seeds, and their standard errors.
 
-    An estimate is a function of sums, usually a ratio. Its error comes from leaving out one group of blocks at a time.
-    Successive blocks are correlated, larger groups less so: the error returned is the largest over group sizes up to
-    32 that leave at least four groups (the blocking method: Flyvbjerg and Petersen, J. Chem. Phys. 91, 461, 1989).
+    An estimate is a function of sums, usually a ratio. Its error comes from leaving out one group
+    of blocks at a time. Successive blocks are correlated, larger groups less so: the error returned
+    is the largest over group sizes up to 32 that leave at least four groups (the blocking method:
+    Flyvbjerg and Petersen, J. Chem. Phys. 91, 461, 1989).
 
     Args:
-      estimate: maps a pytree of sums with any leading axes to by_name estimates with the same leading axes.
+      estimate: maps a pytree of sums with any leading axes to by_name estimates with the same
+        leading axes.
       sums: pytree of arrays of shape (seeds, blocks, ...), in any units.
 
     Returns:
-      Estimates and standard errors, without the axes of seeds and blocks. The error is NaN for fewer than two blocks.
+      Estimates and standard errors, without the axes of seeds and blocks. The error is NaN for
+      fewer than two blocks.
 
     Examples:
-      Eight blocks with a trend. Independent blocks would have an error of 0.87; pairs of blocks have a larger one.
+      Eight blocks with a trend. Independent blocks would have an error of 0.87; pairs of blocks
+      have a larger one.
 
       >>> blocks = {"x": np.arange(1.0, 9.0)[None], "steps": np.ones((1, 8))}
       >>> value, error = jackknife(lambda sums: {"mean": sums["x"] / sums["steps"]}, blocks)
@@ -145,25 +170,31 @@ def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[
     merges = [m for m in BLOCK_MERGES if seeds * (blocks // m) >= (2 if m == 1 else _FEWEST_GROUPS)]
     edges = np.cumsum([1, *(seeds * (blocks // m) for m in merges)])
     flat, by_name = _flat(estimate(jax.tree.map(lambda x: _whole_and_parts(x, merges), sums)))
-    spreads = [np.full_like(flat[0], np.nan), *(_spread(part) for part in np.split(flat, edges)[1:-1])]
+    spreads = [
+        np.full_like(flat[0], np.nan),
+        *(_spread(part) for part in np.split(flat, edges)[1:-1]),
+    ]
     return by_name(flat[0]), by_name(np.fmax.reduce(spreads))
 
 
 def correlation_length(
     estimate: Callable[[Any], Mapping[str, Any]], sums: Any, lengths: np.ndarray | None = None
 ) -> Estimates:
-    """Statistical inefficiency: the number of successive blocks that count as one independent sample, at least one.
+    """Statistical inefficiency: the number of successive blocks that count as one independent
+    sample, at least one.
 
-    g = 1 + 2 Σ (1 − k/B) ρ_k, where ρ_k is the autocorrelation at lag k of the jackknife influences of the B blocks of
-    a seed, averaged over seeds: n blocks are worth n/g independent samples. The sum ends before the first pair
-    ρ_2k + ρ_2k+1 that is not positive, since later terms are noise (C. J. Geyer, Stat. Sci. 7, 473, 1992). A series
-    not many times longer than g underestimates it: 32 blocks give 3 instead of 4, and 4.6 instead of 9.
+    g = 1 + 2 Σ (1 − k/B) ρ_k, where ρ_k is the autocorrelation at lag k of the jackknife influences
+    of the B blocks of a seed, averaged over seeds: n blocks are worth n/g independent samples. The
+    sum ends before the first pair ρ_2k + ρ_2k+1 that is not positive, since later terms are noise
+    (C. J. Geyer, Stat. Sci. 7, 473, 1992). A series not many times longer than g underestimates it:
+    32 blocks give 3 instead of 4, and 4.6 instead of 9.
 
     Args:
       estimate, sums, lengths: as in ``standard_errors``.
 
     Returns:
-      g of each estimate, in blocks of ``merged_blocks``; NaN for fewer than four blocks in the longest seed.
+      g of each estimate, in blocks of ``merged_blocks``; NaN for fewer than four blocks in the
+      longest seed.
     """
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
     counts = merged_blocks(lengths, seeds, blocks)
@@ -174,9 +205,10 @@ def correlation_length(
 def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, float]:
     """Mean of the second half of a series minus that of the first half, and its standard error.
 
-    The error includes the correlation of neighbouring values: the variance of a mean is multiplied by
-    (1 + ρ)/(1 − ρ), with ρ the lag-one autocorrelation of the halves about their own means. A short series
-    underestimates ρ, so it is clipped to the range from ``least_correlation`` to 0.9. The series needs four values.
+    The error includes the correlation of neighbouring values: the variance of a mean is multiplied
+      by (1 + ρ)/(1 − ρ), with ρ the lag-one autocorrelation of the halves about their own means. A
+      short series underestimates ρ, so it is clipped to the range from ``least_correlation`` to
+      0.9. The series needs four values.
     """
     half = len(series) // 2
     halves = np.stack([series[:half], series[-half:]])
@@ -186,24 +218,29 @@ def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, fl
     lagged = np.sum(residuals[:, 1:] * residuals[:, :-1]) / max(squares, np.finfo(float).tiny)
     correlation = np.clip(lagged, least_correlation, 0.9)
     variance = squares / (2 * half - 2) * 2 / half
-    return float(means[1] - means[0]), float(np.sqrt(variance * (1 + correlation) / (1 - correlation)))
+    return float(means[1] - means[0]), float(
+        np.sqrt(variance * (1 + correlation) / (1 - correlation))
+    )
 
 
 def _influences(
     estimate: Callable[[Any], Mapping[str, Any]], sums: Any, lengths: np.ndarray | None
 ) -> tuple[np.ndarray, list[np.ndarray], np.ndarray, Callable[[np.ndarray], Estimates]]:
-    """Estimates (n,), influences of the blocks of each seed (blocks, n), their scale, and ``by_name``.
+    """Estimates (n,), influences of the blocks of each seed (blocks, n), their scale, and
+    ``by_name``.
 
-    The influence of a block is (B - 1) times the mean of the leave-one-out estimates minus the one without the block,
-    for B blocks in all, divided by the scale (its root mean square, NaN for rounding only). A seed has at most
-    ``_MOST_BLOCKS`` blocks.
+    The influence of a block is (B - 1) times the mean of the leave-one-out estimates minus the one
+    without the block, for B blocks in all, divided by the scale (its root mean square, NaN for
+    rounding only). A seed has at most ``_MOST_BLOCKS`` blocks.
     """
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
     counts = merged_blocks(lengths, seeds, min(blocks, _MOST_BLOCKS))
     total = int(counts.sum())
     parts = jax.tree.map(lambda x: _joined(x, counts), sums)
     rows = [lambda x: x.sum(axis=0)[None], *([_all_but_one] if total > 1 else [])]
-    flat, by_name = _flat(estimate(jax.tree.map(lambda x: np.concatenate([row(x) for row in rows]), parts)))
+    flat, by_name = _flat(
+        estimate(jax.tree.map(lambda x: np.concatenate([row(x) for row in rows]), parts))
+    )
     without = flat[1:].astype(float) if total > 1 else np.full(flat.shape, np.nan)
     influence = (total - 1) * (without.mean(axis=0) - without)
     scale = np.sqrt(np.mean(influence**2, axis=0))
@@ -213,9 +250,13 @@ def _influences(
 
 
 def _joined(x: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """The blocks (seeds, blocks, ...) of all seeds, (Σ counts, ...), those of a seed merged to its number of them."""
+    """The blocks (seeds, blocks, ...) of all seeds, (Σ counts, ...), those of a seed merged to its
+    number of them.
+    """
     firsts = (np.arange(count) * x.shape[1] // count for count in counts)
-    return np.concatenate([np.add.reduceat(seed, first, axis=0) for seed, first in zip(x, firsts, strict=True)])
+    return np.concatenate(
+        [np.add.reduceat(seed, first, axis=0) for seed, first in zip(x, firsts, strict=True)]
+    )
 
 
 @lru_cache(maxsize=_MOST_BLOCKS)
@@ -229,11 +270,15 @@ def _correlation_models(blocks: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _prior() -> np.ndarray:
     """Logarithm of the prior (models,): times, and the shares of white noise of each."""
-    return np.repeat(np.log(_TIMES**0.25 / (1 + (_TIMES / _EXPECTED_TIME) ** 2)), len(_WHITE_SHARES))
+    return np.repeat(
+        np.log(_TIMES**0.25 / (1 + (_TIMES / _EXPECTED_TIME) ** 2)), len(_WHITE_SHARES)
+    )
 
 
 def _posterior(seeds: Sequence[np.ndarray]) -> _Posterior:
-    """Posterior of n means from series (blocks, n) of plain mean zero, one a seed; see ``standard_errors``."""
+    """Posterior of n means from series (blocks, n) of plain mean zero, one a seed; see
+    ``standard_errors``.
+    """
     count = seeds[0].shape[1]
     freedom = sum(map(len, seeds)) - 1
     information = weighted = square = determinant = np.zeros(1)
@@ -247,22 +292,28 @@ def _posterior(seeds: Sequence[np.ndarray]) -> _Posterior:
         ones = vectors.sum(axis=1)[:, None]
         squares = (modes**2).reshape(len(modes), blocks, number, count).sum(axis=2)
         sums = modes.reshape(len(modes), blocks, number, count).sum(axis=2)
-        information = information + number * (ones**2 / eigenvalues).sum(axis=2).reshape(models, 1)  # 1'R⁻¹1
+        information = information + number * (ones**2 / eigenvalues).sum(axis=2).reshape(
+            models, 1
+        )  # 1'R⁻¹1
         weighted = weighted + ((ones / eigenvalues) @ sums).reshape(models, count)  # 1'R⁻¹x
         square = square + ((1 / eigenvalues) @ squares).reshape(models, count)  # x'R⁻¹x
         determinant = determinant + number * np.log(eigenvalues).sum(axis=2).reshape(models, 1)
     shift = weighted / information
     residual = np.maximum(square - weighted * shift, np.finfo(float).tiny)
-    log_weight = prior[:, None] - (determinant + np.log(information) + freedom * np.log(residual)) / 2
+    log_weight = (
+        prior[:, None] - (determinant + np.log(information) + freedom * np.log(residual)) / 2
+    )
     weight = np.exp(log_weight - log_weight.max(axis=0))
-    return _Posterior(weight / weight.sum(axis=0), shift, np.sqrt(residual / (freedom * information)), freedom)
+    return _Posterior(
+        weight / weight.sum(axis=0), shift, np.sqrt(residual / (freedom * information)), freedom
+    )
 
 
 def _half_width(posterior: _Posterior) -> np.ndarray:
     """Half-width (n,) of the interval around zero that contains a mean with probability ``_LEVEL``.
 
-    Newton's method, with Student's distribution interpolated from a table over z/√(ν + z²), since it is evaluated
-    300 times for each mean.
+    Newton's method, with Student's distribution interpolated from a table over z/√(ν + z²), since
+    it is evaluated 300 times for each mean.
     """
     weight, shift, width, freedom = posterior
     freedom = min(freedom, _MOST_FREEDOM)
@@ -270,7 +321,9 @@ def _half_width(posterior: _Posterior) -> np.ndarray:
     half = np.sqrt(np.sum(weight * ((quantile * width) ** 2 + shift**2), axis=0))
     for _ in range(_NEWTON_STEPS):
         z = np.stack([half - shift, half + shift]) / width
-        place = z / np.hypot(np.sqrt(freedom), z)  # z of a constant series is so large that its square overflows
+        place = z / np.hypot(
+            np.sqrt(freedom), z
+        )  # z of a constant series is so large that its square overflows
         excess = np.sum(weight * np.interp(place, places, probability), axis=(0, 1)) - 1 - _LEVEL
         slope = np.sum(weight / width * np.interp(place, places, density), axis=(0, 1))
         half = np.clip(half - excess / slope, half / 2, 2 * half)
@@ -279,7 +332,8 @@ def _half_width(posterior: _Posterior) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def _student(freedom: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Points u = z/√(ν + z²), distribution and density of Student's t there, and its quantile of the interval.
+    """Points u = z/√(ν + z²), distribution and density of Student's t there, and its quantile of
+    the interval.
 
     With u = sin φ the density of φ is proportional to cos^(ν - 1) φ.
     """
@@ -294,15 +348,21 @@ def _student(freedom: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
 
 
 def _merged(x: np.ndarray, merge: int) -> np.ndarray:
-    """Sums over groups of ``merge`` successive blocks, (seeds · groups, ...); no group spans two seeds."""
+    """Sums over groups of ``merge`` successive blocks, (seeds · groups, ...); no group spans two
+    seeds.
+    """
     seeds, blocks = x.shape[:2]
     groups = blocks // merge
     return x[:, : groups * merge].reshape(seeds * groups, merge, *x.shape[2:]).sum(axis=1)
 
 
 def _whole_and_parts(x: np.ndarray, merges: list[int]) -> np.ndarray:
-    """The sum over all blocks, then for each merge the leave-one-out sums, (1 + groups + groups + ..., ...)."""
-    return np.concatenate([x.sum(axis=(0, 1))[None], *(_all_but_one(_merged(x, m)) for m in merges)])
+    """The sum over all blocks, then for each merge the leave-one-out sums, (1 + groups + groups +
+    ..., ...).
+    """
+    return np.concatenate(
+        [x.sum(axis=(0, 1))[None], *(_all_but_one(_merged(x, m)) for m in merges)]
+    )
 
 
 def _all_but_one(groups: np.ndarray) -> np.ndarray:
@@ -316,7 +376,9 @@ def _spread(without: np.ndarray) -> np.ndarray:
 
 
 def _flat(estimates: Mapping[str, Any]) -> tuple[np.ndarray, Callable[[np.ndarray], Estimates]]:
-    """All estimates with a leading axis as one array (rows, n), and a function that splits a row (n,) by name."""
+    """All estimates with a leading axis as one array (rows, n), and a function that splits a row
+    (n,) by name.
+    """
     arrays = {name: np.asarray(x) for name, x in estimates.items()}
     rows = len(next(iter(arrays.values())))
     edges = np.cumsum([x[0].size for x in arrays.values()])[:-1]

@@ -16,9 +16,9 @@
 # %% [markdown]
 # # Where are collisions binary, and how sure is that?
 #
-# A map of the force ratio over restitution α and packing fraction ν (Lois, Lemaître and Carlson, *Momentum transport in
-# granular flows*), the errors of its numbers, and beside it what `jg.validity` knows without a simulation. `QUICK=1` in
-# the environment makes everything smaller.
+# A map of the force ratio over restitution α and packing fraction ν (Lois, Lemaître and Carlson,
+# *Momentum transport in granular flows*), the errors of its numbers, and beside it what
+# `jg.validity` knows without a simulation. `QUICK=1` in the environment makes everything smaller.
 
 # %%
 import os
@@ -43,25 +43,29 @@ run = {"grains": 64, "seeds": 1} if quick else {"grains": 256, "seeds": 2}
 # %% [markdown]
 # ## The map
 #
-# Each point is a few independent flows, the seeds. Each is packed, sheared until it is steady, and sampled over six
-# correlation strains. A point where something went wrong keeps its value and has a status.
+# Each point is a few independent flows, the seeds. Each is packed, sheared until it is steady, and
+# sampled over six correlation strains. A point where something went wrong keeps its value and has a
+# status.
 
 # %%
 data = jg.ratio_map(restitution, packing_fraction, timestep=timestep, **run)
 print(f"{int((data.status == jg.Status.ok).sum())} of {data.status.size} points have the status ok")
-print(f"force ratio ± one standard error, N = {run['grains']}, dt = {timestep:g}; a column for each α:")
+print(
+    f"force ratio ± one standard error, N = {run['grains']}, dt = {timestep:g}; a column for each "
+    "α:"
+)
 xr.apply_ufunc(with_error, data.force_ratio, data.force_ratio_stderr, vectorize=True).to_pandas()
 
 # %% [markdown]
-# The force ratio (a) and the shear-stress ratio (b) with one standard error. Both belong to the time step that the
-# caption names.
+# The force ratio (a) and the shear-stress ratio (b) with one standard error. Both belong to the
+# time step that the caption names.
 
 # %%
 jg.ratio_curves(data)
 
 # %% [markdown]
-# Contours of the excess, the force ratio less one. Above the lowest one the mean force exceeds that of binary
-# collisions by more than a twentieth, at this time step.
+# Contours of the excess, the force ratio less one. Above the lowest one the mean force exceeds that
+# of binary collisions by more than a twentieth, at this time step.
 
 # %%
 jg.ratio_contours(data)
@@ -69,30 +73,40 @@ jg.ratio_contours(data)
 # %% [markdown]
 # ## The parts of the total error
 #
-# A standard error says how far another sample of the same flow may be off. The total error also bounds what the time
-# step, the number of grains and the tolerance of the solver change: it is half of a 95 % interval for a large system
-# with exact collisions. A force ratio belongs to its time step, so it has no error from dt. In per cent, at one point:
+# A standard error says how far another sample of the same flow may be off. The total error also
+# bounds what the time step, the number of grains and the tolerance of the solver change: it is half
+# of a 95 % interval for a large system with exact collisions. A force ratio belongs to its time
+# step, so it has no error from dt. In per cent, at one point:
 
 # %%
 names = ["force_ratio", "pressure", "shear_stress", "granular_temperature"]
 point = data.to_dataset().isel(restitution=1, packing_fraction=1)
-print(f"α = {point.restitution:g}, ν = {point.packing_fraction:g}, N = {run['grains']}, dt = {timestep}")
-xr.Dataset({name: 100 * point[f"{name}_ci95"] / point[name] for name in names}).to_dataframe()[names].round(2)
+print(
+    f"α = {point.restitution:g}, ν = {point.packing_fraction:g}, N = {run['grains']}, dt = "
+    f"{timestep}"
+)
+xr.Dataset({name: 100 * point[f"{name}_ci95"] / point[name] for name in names}).to_dataframe()[
+    names
+].round(2)
 
 # %% [markdown]
-# The largest part decides what to do about it: more strain or seeds for sampling, more grains for size.
+# The largest part decides what to do about it: more strain or seeds for sampling, more grains for
+# size.
 
 # %% [markdown]
 # ## Beside the reference map
 #
-# `jg.validity` reads a map of N = 1000 and dt = 1e-5 that was measured once. Its pressure should agree with that above
-# within the combined intervals, although N and dt differ. Its force ratio need not, since it belongs to another dt.
+# `jg.validity` reads a map of N = 1000 and dt = 1e-5 that was measured once. Its pressure should
+# agree with that above within the combined intervals, although N and dt differ. Its force ratio
+# need not, since it belongs to another dt.
 
 # %%
 alpha, nu = np.meshgrid(restitution, packing_fraction)
 known = jg.validity(alpha, nu)
 measured, error = data.pressure.values, data.pressure_ci95.sel(error_source="total").values
-inside = abs(measured - known.measured["pressure"]) <= np.hypot(error, known.measured_ci95["pressure"])
+inside = abs(measured - known.measured["pressure"]) <= np.hypot(
+    error, known.measured_ci95["pressure"]
+)
 print(f"pressure: {inside.sum()} of {inside.size} differences within the combined 95 % intervals")
 
 # %%
@@ -103,7 +117,15 @@ for k, one in enumerate(restitution):
     middle, half = line.measured["pressure"], line.measured_ci95["pressure"]
     shade = plt.cm.viridis(0.85 * k / (len(restitution) - 1))
     axes.fill_between(fine, middle - half, middle + half, color=shade, alpha=0.3, lw=0)
-    axes.errorbar(packing_fraction, measured[:, k], error[:, k], fmt="os^Dv"[k], ms=3.5, color=shade, label=one)
+    axes.errorbar(
+        packing_fraction,
+        measured[:, k],
+        error[:, k],
+        fmt="os^Dv"[k],
+        ms=3.5,
+        color=shade,
+        label=one,
+    )
 axes.set(yscale="log", xlabel=r"packing fraction $\nu$", ylabel=r"pressure $p$ / $m\dot\gamma^2$")
 axes.legend(title=r"restitution $\alpha$", title_fontsize=7, fontsize=7, frameon=False)
 plt.show()
@@ -113,17 +135,25 @@ plt.show()
 #
 # ## Does kinetic theory hold where collisions are binary?
 #
-# Not necessarily. A force ratio near one says that clusters carry little, not that velocities are independent. The best
-# theory of this package, moments of an anisotropic Gaussian with Enskog's collision rate, against the reference map:
+# Not necessarily. A force ratio near one says that clusters carry little, not that velocities are
+# independent. The best theory of this package, moments of an anisotropic Gaussian with Enskog's
+# collision rate, against the reference map:
 
 # %%
 for one in [(0.9, 0.6), (0.8, 0.75), (0.5, 0.4), (0.2, 0.5)]:
     print(f"α = {one[0]}, ν = {one[1]}: {jg.validity(*one).verdict()}\n")
 
 # %%
-off, interval, ratio = known.error["pressure"], known.error_ci95["pressure"], known.measured["force_ratio"]
+off, interval, ratio = (
+    known.error["pressure"],
+    known.error_ci95["pressure"],
+    known.measured["force_ratio"],
+)
 near = ratio < 1.05
-print(f"{near.sum()} of {near.size} points have a force ratio below 1.05 (N = 1000, dt = 1e-5); at", end=" ")
+print(
+    f"{near.sum()} of {near.size} points have a force ratio below 1.05 (N = 1000, dt = 1e-5); at",
+    end=" ",
+)
 print(f"{(near & (abs(off) < 0.1)).sum()} of these the theory's pressure is within 10 %")
 
 # %%
@@ -135,10 +165,16 @@ for k, one in enumerate(restitution):
     axes.errorbar(packing_fraction, 100 * off[:, k], 100 * interval[:, k], label=one, **style)
     axes.plot(nu[near[:, k], k], 100 * off[near[:, k], k], "os^Dv"[k], ms=4, color=shade, zorder=4)
 axes.set(xlabel=r"packing fraction $\nu$", ylabel="theory's error of the pressure (%)")
-keys = {"title": r"restitution $\alpha$", "title_fontsize": 7, "fontsize": 7, "frameon": False, "columnspacing": 0.8}
+keys = {
+    "title": r"restitution $\alpha$",
+    "title_fontsize": 7,
+    "fontsize": 7,
+    "frameon": False,
+    "columnspacing": 0.8,
+}
 figure.legend(loc="outside upper center", ncols=len(restitution), handletextpad=0.2, **keys)
 plt.show()
 
 # %% [markdown]
-# Filled symbols: force ratio below 1.05. Grey: 10 %. Bars: 95 % intervals for a large system. The theory fails well
-# below the lowest contour of the force ratio, and the next notebook says why.
+# Filled symbols: force ratio below 1.05. Grey: 10 %. Bars: 95 % intervals for a large system. The
+# theory fails well below the lowest contour of the force ratio, and the next notebook says why.

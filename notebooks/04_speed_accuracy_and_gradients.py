@@ -16,9 +16,9 @@
 # %% [markdown]
 # # How fast and how accurate is a run, and what are its gradients good for?
 #
-# The cost and the error of a time step, many flows at once by `jax.vmap` over restitution α and packing fraction ν, and
-# a derivative that is checked against finite differences and then finds α. `QUICK=1` in the environment makes
-# everything smaller.
+# The cost and the error of a time step, many flows at once by `jax.vmap` over restitution α and
+# packing fraction ν, and a derivative that is checked against finite differences and then finds α.
+# `QUICK=1` in the environment makes everything smaller.
 
 # %%
 import os
@@ -43,8 +43,9 @@ grains, strain, seeds = (64, 2.0, 4) if quick else (256, 20.0, 8)
 # %% [markdown]
 # ## A time step costs less than it seems
 #
-# Steps without a contact are jumped over, so a run costs its collisions and not its steps. Several seeds of one flow
-# from the same states, with ever shorter time steps. The first sample lets the contacts adapt, and compiles.
+# Steps without a contact are jumped over, so a run costs its collisions and not its steps. Several
+# seeds of one flow from the same states, with ever shorter time steps. The first sample lets the
+# contacts adapt, and compiles.
 
 # %%
 timesteps = [3e-3, 1e-3, 3e-4, 1e-4] + ([] if quick else [3e-5])
@@ -63,15 +64,18 @@ for timestep in timesteps:
 mean = {name: np.mean(x, axis=1) for name, x in values.items()}
 stderr = {name: np.std(x, axis=1, ddof=1) / seeds**0.5 for name, x in values.items()}
 temperature = float(np.mean(samples.granular_temperature))
-print(f"α = {alpha}, ν = {nu}, N = {grains}, {seeds} seeds of strain {strain:g}, ± one standard error over seeds")
+print(
+    f"α = {alpha}, ν = {nu}, N = {grains}, {seeds} seeds of strain {strain:g}, ± one standard "
+    "error over seeds"
+)
 for k, timestep in enumerate(timesteps):
     both = [f"{name} {with_error(mean[name][k], stderr[name][k])}" for name in values]
     print(f"dt = {timestep:.0e}: {cost[k]:6.2f} ms of a core per unit strain, {', '.join(both)}")
 
 # %% [markdown]
-# The bound on the error comes from how far a grain of thermal speed moves in a step, over the mean gap.
-# `timestep="auto"` in a map chooses dt by it. The reference below is the shortest step, whose own error is in every
-# bar.
+# The bound on the error comes from how far a grain of thermal speed moves in a step, over the mean
+# gap. `timestep="auto"` in a map chooses dt by it. The reference below is the shortest step, whose
+# own error is in every bar.
 
 # %%
 figure, (axes, below) = plt.subplots(2, 1, figsize=(3.35, 4.0), sharex=True, height_ratios=(2, 1))
@@ -87,22 +91,26 @@ axes.set(xscale="log", ylabel=f"difference from dt = {timesteps[-1]:.0e} (%)")
 axes.legend(fontsize=7, frameon=False, loc="upper left")
 below.plot(timesteps, cost, "ko-", ms=4)
 below.set(
-    xlabel=r"time step $\dot\gamma\,\mathrm{d}t$", ylabel="core time of a\nunit strain (ms)", ylim=(0, 1.3 * max(cost))
+    xlabel=r"time step $\dot\gamma\,\mathrm{d}t$",
+    ylabel="core time of a\nunit strain (ms)",
+    ylim=(0, 1.3 * max(cost)),
 )
 plt.show()
 
 # %% [markdown]
-# The pressure at dt = 1e-3 is that of the shortest step within its noise. A force ratio belongs to its time step, so
-# its difference is no error.
+# The pressure at dt = 1e-3 is that of the shortest step within its noise. A force ratio belongs to
+# its time step, so its difference is no error.
 #
 # ## Many flows at once
 #
-# `jax.vmap` over α and ν shares out the replicas to all cores and returns the same bits as a loop. A change of α, ν or
-# dt compiles nothing.
+# `jax.vmap` over α and ν shares out the replicas to all cores and returns the same bits as a loop.
+# A change of α, ν or dt compiles nothing.
 
 # %%
 size = 2 if quick else 4
-alphas, nus = (x.ravel() for x in np.meshgrid(np.linspace(0.5, 0.9, size), np.linspace(0.4, 0.7, size)))
+alphas, nus = (
+    x.ravel() for x in np.meshgrid(np.linspace(0.5, 0.9, size), np.linspace(0.4, 0.7, size))
+)
 flows = jg.ShearFlow(64, alphas, nus, timestep=1e-3)
 states = jg.prepare(flows, jax.random.split(jax.random.key(1), len(alphas)))
 run = jax.jit(jax.vmap(jg.sample, (0, 0, None)))
@@ -120,15 +128,19 @@ for name, way in ways.items():
     begun = time.perf_counter()
     ratios[name] = np.asarray(way(flows, states, 5.0))
     steps = len(alphas) * 5.0 / 1e-3
-    print(f"{name}: {1e6 * (time.perf_counter() - begun) / steps:.2f} µs per replica and time step (N = 64, dt = 1e-3)")
+    print(
+        f"{name}: {1e6 * (time.perf_counter() - begun) / steps:.2f} µs per replica and time step "
+        "(N = 64, dt = 1e-3)"
+    )
 assert np.array_equal(*ratios.values())
 
 # %% [markdown]
 # ## A derivative, checked
 #
-# `jg.advance` is differentiable: the contact solve by the implicit function theorem, the flight directly. Reverse mode
-# needs the number of steps with contacts, `events`, in advance. Here the derivative of the kinetic energy after 50
-# steps with respect to α stands beside central differences.
+# `jg.advance` is differentiable: the contact solve by the implicit function theorem, the flight
+# directly. Reverse mode needs the number of steps with contacts, `events`, in advance. Here the
+# derivative of the kinetic energy after 50 steps with respect to α stands beside central
+# differences.
 
 # %%
 solver = jg.BarzilaiBorwein(tolerance=1e-10)
@@ -151,12 +163,18 @@ print(f"N = 64, dt = 1e-3, {events} steps with contacts: dE/dα = {exact:.8f} by
 widths = np.logspace(-8, -3, 11)
 differences = np.array([float(energy(0.6 + h) - energy(0.6 - h)) / (2 * h) for h in widths])
 best = int(np.argmin(abs(differences - exact)))
-print(f"central differences agree to {abs(differences[best] / exact - 1):.0e} at h = {widths[best]:.0e}")
+print(
+    f"central differences agree to {abs(differences[best] / exact - 1):.0e} at h = "
+    f"{widths[best]:.0e}"
+)
 
 # %%
 figure, axes = plt.subplots(figsize=(3.35, 2.4))
 axes.loglog(widths, abs(differences / exact - 1), "ko-", ms=4)
-axes.set(xlabel=r"half-width $h$ of the difference in $\alpha$", ylabel="relative difference from jax.grad")
+axes.set(
+    xlabel=r"half-width $h$ of the difference in $\alpha$",
+    ylabel="relative difference from jax.grad",
+)
 plt.show()
 
 # %% [markdown]
@@ -164,9 +182,9 @@ plt.show()
 #
 # ## A derivative, put to use
 #
-# What is the restitution of grains that were seen twice? Short windows of a flow are observed at their start, and at
-# their end with noise of a thousandth of a diameter in positions. `jg.fit_trajectory` minimises the misfit by optax,
-# through the simulator in reverse mode.
+# What is the restitution of grains that were seen twice? Short windows of a flow are observed at
+# their start, and at their end with noise of a thousandth of a diameter in positions.
+# `jg.fit_trajectory` minimises the misfit by optax, through the simulator in reverse mode.
 
 # %%
 truth, guess, windows, dt = 0.73, 0.5, (3 if quick else 6), 1e-5
@@ -183,16 +201,24 @@ def fitted(strain):
     """The fit of windows of this strain, from a wrong restitution."""
     steps = round(strain / dt)
     end, _ = jax.jit(jg.advance)(flow, starts, jnp.int32(steps))
-    positions, velocities = noisy(end.positions, position_noise, 1), noisy(end.velocities, velocity_noise, 2)
+    positions, velocities = (
+        noisy(end.positions, position_noise, 1),
+        noisy(end.velocities, velocity_noise, 2),
+    )
     seen = replace(end, positions=positions, velocities=velocities)
-    return jg.fit_trajectory(replace(flow, restitution=guess), starts, seen, steps, position_noise, velocity_noise)
+    return jg.fit_trajectory(
+        replace(flow, restitution=guess), starts, seen, steps, position_noise, velocity_noise
+    )
 
 
 fits = {}
 for strain in (0.02, 0.05, 1.0) if quick else (0.02, 0.05, 0.1, 0.2, 0.4, 1.0):
     try:
         fits[strain] = fitted(strain)
-        print(f"strain {strain}: α = {with_error(fits[strain].restitution, fits[strain].stderr)}, made with {truth}")
+        print(
+            f"strain {strain}: α = {with_error(fits[strain].restitution, fits[strain].stderr)}, "
+            f"made with {truth}"
+        )
     except jg.InputError as refused:
         print(f"strain {strain}: refused, {refused}")
 
@@ -209,7 +235,8 @@ axes[1].set(xscale="log", xlabel="strain of a window", ylabel=r"restitution $\al
 plt.show()
 
 # %% [markdown]
-# Red: the α that the data were made with. The error bar shrinks with the strain, as derivatives grow exponentially:
-# colliding discs are chaotic. Where a change of α leads to other collisions, at an rms of ∂(position)/∂α of one
-# diameter, differentiation stops to be useful, and the fit refuses the windows. Before that, a fit that ends in a
-# minimum with other collisions is refused by its misfit.
+# Red: the α that the data were made with. The error bar shrinks with the strain, as derivatives
+# grow exponentially: colliding discs are chaotic. Where a change of α leads to other collisions, at
+# an rms of ∂(position)/∂α of one diameter, differentiation stops to be useful, and the fit refuses
+# the windows. Before that, a fit that ends in a minimum with other collisions is refused by its
+# misfit.

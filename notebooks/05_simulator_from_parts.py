@@ -16,9 +16,10 @@
 # %% [markdown]
 # # How much code is a simulator?
 #
-# About sixty lines, if its parts are public: the sheared cell of a state as a space of jax-md, jax-md's neighbour list,
-# and the contact solver of jaxgran. `jax.vmap` runs them over restitutions α, packing fractions ν and seeds. The result
-# is compared with `jg.sample`. `QUICK=1` in the environment makes everything smaller.
+# About sixty lines, if its parts are public: the sheared cell of a state as a space of jax-md,
+# jax-md's neighbour list, and the contact solver of jaxgran. `jax.vmap` runs them over restitutions
+# α, packing fractions ν and seeds. The result is compared with `jg.sample`. `QUICK=1` in the
+# environment makes everything smaller.
 
 # %%
 import os
@@ -36,7 +37,9 @@ from jaxgran.model.display import with_error
 
 jax.config.update("jax_enable_x64", True)
 jg.use_cache()
-warnings.filterwarnings("ignore", "scatter inputs have incompatible types")  # of jax-md's lists, harmless
+warnings.filterwarnings(
+    "ignore", "scatter inputs have incompatible types"
+)  # of jax-md's lists, harmless
 quick = bool(os.environ.get("QUICK"))
 alphas, nus = ([0.3], [0.5, 0.7]) if quick else ([0.3, 0.9], [0.5, 0.6, 0.7])
 steps, seeds = (40, 2) if quick else (2000, 8)
@@ -56,8 +59,8 @@ states = jg.prepare(flows, jax.random.split(jax.random.key(0), len(restitution))
 # %% [markdown]
 # ## Neighbours, by jax-md
 #
-# The list is allocated for the densest flow and updated in every step. An update does not notice that the cell is
-# sheared, so `dr_threshold=0` makes each one a new search.
+# The list is allocated for the densest flow and updated in every step. An update does not notice
+# that the cell is sheared, so `dr_threshold=0` makes each one a new search.
 
 # %%
 densest = states[int(np.argmax(packing_fraction))]
@@ -69,9 +72,9 @@ pairs = neighbours.allocate(densest.positions, extra_capacity=1)
 # %% [markdown]
 # ## One time step
 #
-# Pairs that half a step of free flight makes overlap are contacts. All contacts of the step are solved together. Then
-# the grains fly straight in the laboratory frame, while the cell is sheared. Velocities of a state are those relative
-# to the shear.
+# Pairs that half a step of free flight makes overlap are contacts. All contacts of the step are
+# solved together. Then the grains fly straight in the laboratory frame, while the cell is sheared.
+# Velocities of a state are those relative to the shear.
 
 
 # %%
@@ -86,14 +89,18 @@ def contacts(flow, state):
     velocity = velocity.at[:, 0].add(flow.shear_rate * separation[:, 1])
     ahead = jnp.linalg.norm(separation + velocity * flow.timestep / 2, axis=1)
     touching = used & (ahead < radii[i] + radii[j])
-    normals = jnp.where(touching[:, None], separation, 0) / jnp.linalg.norm(separation, axis=1, keepdims=True)
+    normals = jnp.where(touching[:, None], separation, 0) / jnp.linalg.norm(
+        separation, axis=1, keepdims=True
+    )
     approach = jnp.sum(normals * velocity, axis=1)
     network = jg.ContactNetwork(jnp.stack([i, j], axis=1), normals, state.grains.masses, approach)
     return network, near.did_buffer_overflow
 
 
 def step(flow, state):
-    """The state a time step later, and sums over its contacts: Σ p, Σ p of binary collisions, overflows."""
+    """The state a time step later, and sums over its contacts: Σ p, Σ p of binary collisions,
+    overflows.
+    """
     network, overflow = contacts(flow, state)
     (i, j), masses = network.ends.T, network.masses
     impulses = jg.solve_contacts(network, flow.restitution, solver).impulses
@@ -131,9 +138,10 @@ assert not sums[:, 2].any()  # the list has held all pairs
 # %% [markdown]
 # ## Against `jg.sample`
 #
-# The engine of the package starts from the same states. Over 40 steps the sums of impulses agree to ten tolerances of
-# the solver. Colliding discs are chaotic, so after that only averages compare: the force ratio Σ p over Σ p of binary
-# collisions, with a standard error from the jackknife over seeds.
+# The engine of the package starts from the same states. Over 40 steps the sums of impulses agree to
+# ten tolerances of the solver. Colliding discs are chaotic, so after that only averages compare:
+# the force ratio Σ p over Σ p of binary collisions, with a standard error from the jackknife over
+# seeds.
 
 # %%
 _, samples = jg.sample(flows, states, steps * flows.timestep, blocks=1)
@@ -151,17 +159,35 @@ parts = force_ratio(sums[:, 0], sums[:, 1])
 engine = force_ratio(tally.impulse, tally.binary_impulse)
 print(f"N = 64, dt = 1e-3, {seeds} seeds of strain {steps * 1e-3:g}")
 for (alpha, nu), *row in zip(points, *parts, *engine, strict=True):
-    print(f"α = {alpha}, ν = {nu}: from parts {with_error(*row[:2])}, jg.sample {with_error(*row[2:])},", end=" ")
+    print(
+        f"α = {alpha}, ν = {nu}: from parts {with_error(*row[:2])}, jg.sample "
+        f"{with_error(*row[2:])},",
+        end=" ",
+    )
     print(f"difference {(row[0] - row[2]) / np.hypot(row[1], row[3]):+.1f} standard errors")
 
 # %%
 plt.rcParams.update({"font.size": 8, "figure.dpi": 150, "figure.constrained_layout.use": True})
 figure, axes = plt.subplots(figsize=(3.35, 2.8))
-for (ratio, error), mark, shift, name in ((parts, "o", -0.004, "from parts"), (engine, "s", 0.004, "jg.sample")):
+for (ratio, error), mark, shift, name in (
+    (parts, "o", -0.004, "from parts"),
+    (engine, "s", 0.004, "jg.sample"),
+):
     for k, alpha in enumerate(alphas):
         here = slice(k * len(nus), (k + 1) * len(nus))
-        style = {"fmt": mark, "color": f"C{k}", "mfc": "white" if name == "jg.sample" else f"C{k}", "ms": 4}
-        axes.errorbar(np.add(nus, shift), ratio[here] - 1, error[here], label=rf"$\alpha={alpha}$, {name}", **style)
+        style = {
+            "fmt": mark,
+            "color": f"C{k}",
+            "mfc": "white" if name == "jg.sample" else f"C{k}",
+            "ms": 4,
+        }
+        axes.errorbar(
+            np.add(nus, shift),
+            ratio[here] - 1,
+            error[here],
+            label=rf"$\alpha={alpha}$, {name}",
+            **style,
+        )
 axes.set(xlabel=r"packing fraction $\nu$", ylabel=r"force ratio − 1", yscale="log", xticks=nus)
 axes.legend(fontsize=7, frameon=False, loc="upper left")
 plt.show()

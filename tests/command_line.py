@@ -25,7 +25,9 @@ from jaxgran.model.status import Status
 POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
 
 
-commands = cache(typer.main.get_command)  # Typer makes them anew at every call, which takes longer than a mistake
+commands = cache(
+    typer.main.get_command
+)  # Typer makes them anew at every call, which takes longer than a mistake
 
 
 class Outcome(NamedTuple):
@@ -54,13 +56,19 @@ def jaxgran(folder: Path, *arguments: str) -> Outcome:
 def in_a_process(folder: Path, *arguments: str) -> Outcome:
     """Run a command as its user would, in a process of its own."""
     command = [sys.executable, "-c", "from jaxgran.cli.app import program; program()", *arguments]
-    environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}  # set by JAX
+    environment = {
+        name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"
+    }  # set by JAX
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     return Outcome(done.returncode, done.stdout, done.stderr)
 
 
-def made_up_replicas(statuses: dict[tuple[int, int], Status], end: type[BaseException] | None = None) -> Callable:
-    """A stand-in for the sweep that yields replicas with given statuses and then perhaps stops with an exception."""
+def made_up_replicas(
+    statuses: dict[tuple[int, int], Status], end: type[BaseException] | None = None
+) -> Callable:
+    """A stand-in for the sweep that yields replicas with given statuses and then perhaps stops with
+    an exception.
+    """
 
     def replicas(settings, workers, report, checkpoint, scheduler, record, made) -> Iterator:
         rng = np.random.default_rng(0)
@@ -77,11 +85,15 @@ def made_up_replicas(statuses: dict[tuple[int, int], Status], end: type[BaseExce
 
 
 def write_few_variables(patch: pytest.MonkeyPatch, *more: str) -> None:
-    """Files of maps have the ratios and what is named: to write and read all variables takes a second or two."""
+    """Files of maps have the ratios and what is named: to write and read all variables takes a
+    second or two.
+    """
     whole, names = results.write_dataset, ("force_ratio", "stress_ratio", *more)
     kept = {f"{name}{end}" for name in names for end in ("", "_stderr", "_ci95")}
     kept |= {"status", "seeds/status", "seeds/strain"}
-    patch.setattr(results, "write_dataset", lambda data, path: whole(with_variables(data, *kept), path))
+    patch.setattr(
+        results, "write_dataset", lambda data, path: whole(with_variables(data, *kept), path)
+    )
 
 
 def files(folder: Path) -> set[str]:

@@ -1,4 +1,5 @@
-"""Advance a batch from a file on all devices of JAX, here or of two hosts, and write what comes out.
+"""Advance a batch from a file on all devices of JAX, here or of two hosts, and write what comes
+out.
 
 python devices.py START.npz OUTPUT.npz GRAINS [lockstep | COORDINATOR HOST]
 """

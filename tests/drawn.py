@@ -25,7 +25,11 @@ def contour_lines(axes: Axes, colour: str) -> dict[float, np.ndarray]:
     """Return the vertices (points, 2) of the contours of a colour, by their level."""
     lines = {}
     for drawn in axes.collections:
-        if isinstance(drawn, QuadContourSet) and not drawn.filled and same_color(colour_of(drawn), colour):
+        if (
+            isinstance(drawn, QuadContourSet)
+            and not drawn.filled
+            and same_color(colour_of(drawn), colour)
+        ):
             paths = zip(drawn.levels, drawn.get_paths(), strict=True)
             lines |= {float(level): np.asarray(path.vertices) for level, path in paths if len(path)}
     return lines

@@ -8,11 +8,14 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the command line does, before JAX is imported
+os.environ.setdefault(
+    "TF_CPP_MIN_LOG_LEVEL", "3"
+)  # as the command line does, before JAX is imported
 
 from jaxgran.maps import batches, journal, run_replicas
 
-PAUSE = 0.04  # seconds between two blocks of a sample: a small map takes as long as something needs to happen to it
+# Seconds between two blocks of a sample: a small map then lasts until something happens to it
+PAUSE = 0.04
 journal.SECONDS = 0.1  # so that its batches have journals
 batches.batch_size = lambda *_: 2
 # Drawing takes as long as such a map.
@@ -32,11 +35,15 @@ run_replicas.advance_batch = advance_slowly
 
 if FAULT == "disc full":
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, 80_000))  # more than the parameters, less than a batch
+    resource.setrlimit(
+        resource.RLIMIT_FSIZE, (80_000, 80_000)
+    )  # more than the parameters, less than a batch
 
 if __name__ == "__main__":
     from jaxgran.cli.app import program
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what it runs in the background
+    signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell ignores it for what it runs in the background
 
     program()

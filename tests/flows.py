@@ -1,4 +1,6 @@
-"""Flows of ``GRAINS`` grains that tests share; engines that are compiled once for them; when two runs are the same."""
+"""Flows of ``GRAINS`` grains that tests share; engines that are compiled once for them; when two
+runs are the same.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -27,7 +29,9 @@ from jaxgran.sampling.packing import pack
 GRAINS = 32
 COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "status")
 
-OF_INSTANTS = tuple(name for name, row in TABLE.items() if row["kind"] == INSTANT)  # those of the end of an advance
+OF_INSTANTS = tuple(
+    name for name, row in TABLE.items() if row["kind"] == INSTANT
+)  # those of the end of an advance
 
 # Not the same where impulses agree to rounding only: what measures how well a network was solved.
 OF_THE_SOLVER = ("worst_residual", "complementarity", "iterations", "momentum_drift", "overlap")
@@ -65,12 +69,16 @@ def assert_same_state(one, two, atol: float):
 
 
 def assert_same_tally(one: Tally, two: Tally, rtol: float, but: tuple[str, ...] = ()):
-    """Counts agree exactly, sums to a share of the sum itself, and moments to a share of their largest component."""
+    """Counts agree exactly, sums to a share of the sum itself, and moments to a share of their
+    largest component.
+    """
     for name in COUNTS:
         assert getattr(one, name) == getattr(two, name), name
     for name in set(TABLE) - {*COUNTS, *OF_THE_SOLVER, *but}:
         first, second = np.asarray(getattr(one, name)), np.asarray(getattr(two, name))
-        np.testing.assert_allclose(first, second, rtol=0, atol=rtol * np.max(np.abs(second)), err_msg=name)
+        np.testing.assert_allclose(
+            first, second, rtol=0, atol=rtol * np.max(np.abs(second)), err_msg=name
+        )
 
 
 def in_batches(size: int, settings: MapSettings, **options: Any) -> dict[Key, Replica]:
@@ -87,11 +95,21 @@ ENGINES = ("numba", "jax")
 
 @pytest.fixture(scope="session")
 def run():
-    """``run(flow, state, steps, free_flight=True, solver=EXACT)``: the advance by JAX alone, compiled."""
+    """``run(flow, state, steps, free_flight=True, solver=EXACT)``: the advance by JAX alone,
+    compiled.
+    """
     compiled = jax.jit(advance_by_jax)
 
-    def call(flow: ShearFlow, state: State, steps: int, free_flight: bool = True, solver: ProjectedMethod = EXACT):
-        return jax.block_until_ready(compiled(flow, solver, state, jnp.int32(steps), jnp.asarray(free_flight)))
+    def call(
+        flow: ShearFlow,
+        state: State,
+        steps: int,
+        free_flight: bool = True,
+        solver: ProjectedMethod = EXACT,
+    ):
+        return jax.block_until_ready(
+            compiled(flow, solver, state, jnp.int32(steps), jnp.asarray(free_flight))
+        )
 
     return call
 
@@ -109,7 +127,9 @@ def engines(run):
         return run
 
     return {
-        "numba": compiled(lambda flow, solver, state, steps: advance(flow, state, steps, solver=solver)),
+        "numba": compiled(
+            lambda flow, solver, state, steps: advance(flow, state, steps, solver=solver)
+        ),
         "jax": lambda flow, state, steps, solver=EXACT: run(flow, state, steps, solver=solver),
     }
 
@@ -133,7 +153,9 @@ def packed():
 
     @cache
     def packing(packing_fraction: float, seed: int = 0) -> State:
-        state, found = compiled(ShearFlow(GRAINS, 0.5, packing_fraction, 1e-3), jax.random.key(seed))
+        state, found = compiled(
+            ShearFlow(GRAINS, 0.5, packing_fraction, 1e-3), jax.random.key(seed)
+        )
         assert found
         return state
 
@@ -142,7 +164,9 @@ def packed():
 
 @pytest.fixture(scope="session")
 def flowing(packed, run):
-    """``flowing(packing_fraction, seed=0)``: the same after a strain of one, with zero total momentum."""
+    """``flowing(packing_fraction, seed=0)``: the same after a strain of one, with zero total
+    momentum.
+    """
 
     @cache
     def flow_state(packing_fraction: float, seed: int = 0) -> State:
@@ -151,16 +175,20 @@ def flowing(packed, run):
         velocities = np.random.default_rng(seed).normal(size=(GRAINS, 2)) / np.sqrt(masses)
         velocities -= np.sum(masses * velocities, axis=0) / np.sum(masses)
         flow = ShearFlow(GRAINS, 0.7, packing_fraction, 1e-3)
-        return run(flow, replace(state, velocities=jnp.asarray(velocities)), 1000, solver=BarzilaiBorwein())[0]
+        return run(
+            flow, replace(state, velocities=jnp.asarray(velocities)), 1000, solver=BarzilaiBorwein()
+        )[0]
 
     return flow_state
 
 
 @pytest.fixture(scope="session")
 def scene():
-    """``scene(positions, velocities, radii=½, side=40)``: a few grains alone; the others are parked far away.
+    """``scene(positions, velocities, radii=½, side=40)``: a few grains alone; the others are parked
+    far away.
 
-    The velocities are those of the laboratory. Parked grains move with the shear, in rows that keep clear of y < 20.
+    The velocities are those of the laboratory. Parked grains move with the shear, in rows that keep
+    clear of y < 20.
     """
 
     def build(positions, velocities, radii=0.5, side: float = 40.0) -> State:
@@ -175,7 +203,11 @@ def scene():
         every[:few] = radii
         grains = Grains(jnp.asarray(every), jnp.asarray(4 * every**2))
         return State(
-            grains, jnp.asarray(positions), jnp.asarray(peculiar), jnp.asarray(side, float), jnp.asarray(0, float)
+            grains,
+            jnp.asarray(positions),
+            jnp.asarray(peculiar),
+            jnp.asarray(side, float),
+            jnp.asarray(0, float),
         )
 
     return build
@@ -187,6 +219,8 @@ def solved():
     compiled = jax.jit(solve, static_argnums=1)
 
     def call(network, tolerance=1e-12, max_steps=100_000, method=BarzilaiBorwein, active=True):
-        return compiled(network, 60, jnp.asarray(1.0), method(tolerance, max_steps), jnp.asarray(active))
+        return compiled(
+            network, 60, jnp.asarray(1.0), method(tolerance, max_steps), jnp.asarray(active)
+        )
 
     return call

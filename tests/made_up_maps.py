@@ -41,16 +41,28 @@ def ratio_dataset(alphas: int = 5, nus: int = 6, relative_error: float = 0.05) -
 
 
 def with_timesteps(data: xr.Dataset, *timesteps: float) -> xr.Dataset:
-    """Return a map of several time steps whose excess is that of a map at the first and twice as large at each next."""
-    parts = [data.assign(force_ratio=1.0 + 2.0**k * (data.force_ratio - 1.0)) for k in range(len(timesteps))]
+    """Return a map of several time steps whose excess is that of a map at the first and twice as
+    large at each next.
+    """
+    parts = [
+        data.assign(force_ratio=1.0 + 2.0**k * (data.force_ratio - 1.0))
+        for k in range(len(timesteps))
+    ]
     several = xr.concat(parts, xr.Variable("timestep", list(timesteps)))
     return several.assign_attrs(data.attrs | {"timestep": list(timesteps)})
 
 
 def with_grains(data: xr.Dataset, *grains: int, noise: float = 0.01) -> xr.Dataset:
-    """Return a map of several numbers of grains, whose averages grow by different shares for a factor of four."""
+    """Return a map of several numbers of grains, whose averages grow by different shares for a
+    factor of four.
+    """
     random, dims, parts = np.random.default_rng(0), data.force_ratio.dims, []
-    growth = {"pressure": 0.10, "shear_stress": 0.08, "granular_temperature": 0.15, "force_ratio": 0.02}
+    growth = {
+        "pressure": 0.10,
+        "shear_stress": 0.08,
+        "granular_temperature": 0.15,
+        "force_ratio": 0.02,
+    }
     for size in grains:
         part = data
         for name, share in growth.items():
@@ -64,8 +76,13 @@ def with_grains(data: xr.Dataset, *grains: int, noise: float = 0.01) -> xr.Datas
 
 def with_variables(data: xr.DataTree, *names: str) -> xr.DataTree:
     """Return a map with only the named variables, as ``NAME`` or ``GROUP/NAME``."""
-    kept = {node.path: [x for x in node.data_vars if f"{node.path}/{x}".strip("/") in names] for node in data.subtree}
-    return xr.DataTree.from_dict({path: data[path].to_dataset()[chosen] for path, chosen in kept.items()})
+    kept = {
+        node.path: [x for x in node.data_vars if f"{node.path}/{x}".strip("/") in names]
+        for node in data.subtree
+    }
+    return xr.DataTree.from_dict(
+        {path: data[path].to_dataset()[chosen] for path, chosen in kept.items()}
+    )
 
 
 def assumption_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
@@ -79,7 +96,9 @@ def closure_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
 
 
 def factor_of(k: int, x: np.ndarray, nu: np.ndarray) -> np.ndarray:
-    """Return the logarithm of synthetic factor k of a stress; the first is within its error everywhere."""
+    """Return the logarithm of synthetic factor k of a stress; the first is within its error
+    everywhere.
+    """
     return 0.5 * STDERR * (x - x) if k == 0 else (-1.0) ** k * (0.4 * k * x + 0.5 * (nu - 0.55))
 
 
@@ -88,16 +107,23 @@ def share_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
 
 
 def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
-    """Return a synthetic map with stresses, what a theory predicts of them, and shares of clusters."""
+    """Return a synthetic map with stresses, what a theory predicts of them, and shares of
+    clusters.
+    """
     data = ratio_dataset(alphas, nus)
     x, nu = 1.0 - data.restitution.values[None, :], data.packing_fraction.values[:, None]
-    tensors = {f"stresses/{part}_stress": np.zeros((*data.force_ratio.shape, 2, 2)) for part in ("kinetic", "binary")}
+    tensors = {
+        f"stresses/{part}_stress": np.zeros((*data.force_ratio.shape, 2, 2))
+        for part in ("kinetic", "binary")
+    }
     added = {}
     for scale, name in ((3.0, "pressure"), (1.0, "shear_stress")):
         measured = scale * np.exp(2.0 * nu) * np.ones_like(x)
         binary = measured * np.exp(assumption_of(x, nu))
         added |= {name: (DIMS, measured), f"{name}_stderr": (DIMS, STDERR * measured)}
-        for tensor, part in zip(tensors.values(), (0.3 * measured, binary - 0.3 * measured), strict=True):
+        for tensor, part in zip(
+            tensors.values(), (0.3 * measured, binary - 0.3 * measured), strict=True
+        ):
             for a, b in ((0, 0), (1, 1)) if name == "pressure" else ((0, 1), (1, 0)):
                 tensor[..., a, b] = part if a == b else -part
         added[f"theory/{name}"] = (DIMS, binary * np.exp(closure_of(x, nu)))
@@ -106,10 +132,16 @@ def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
         value = np.exp(factor_of(k, x, nu)) * np.ones(data.force_ratio.shape)
         added |= {f"theory/{name}": (DIMS, value), f"theory/{name}_stderr": (DIMS, STDERR * value)}
     added |= {name: ((*DIMS, "axis_a", "axis_b"), tensor) for name, tensor in tensors.items()}
-    added |= {f"{name}_stderr": ((*DIMS, "axis_a", "axis_b"), STDERR * np.abs(x)) for name, x in tensors.items()}
+    added |= {
+        f"{name}_stderr": ((*DIMS, "axis_a", "axis_b"), STDERR * np.abs(x))
+        for name, x in tensors.items()
+    }
     ratio = np.ones((*data.force_ratio.shape, 2, 2))
     added |= {"stress_ratio": ((*DIMS, "axis_a", "axis_b"), ratio)}
     added |= {"stress_ratio_stderr": ((*DIMS, "axis_a", "axis_b"), STDERR * ratio)}
     for name in ("stresses/cluster_pressure_share", "stresses/cluster_shear_share"):
-        added |= {name: (DIMS, share_of(x, nu)), f"{name}_stderr": (DIMS, np.full((nus, alphas), 0.03))}
+        added |= {
+            name: (DIMS, share_of(x, nu)),
+            f"{name}_stderr": (DIMS, np.full((nus, alphas), 0.03)),
+        }
     return data.assign(added)

@@ -1,4 +1,6 @@
-"""Independent answers: brute force over images and pairs, dense matrices, exact solutions of small contact problems."""
+"""Independent answers: brute force over images and pairs, dense matrices, exact solutions of small
+contact problems.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -42,10 +44,15 @@ def delassus(network: Contacts, masses: np.ndarray) -> np.ndarray:
 def exact_velocities(network: Contacts, masses: np.ndarray, velocities: np.ndarray) -> np.ndarray:
     """Velocities (grains, 2) after the contact law at restitution zero.
 
-    They are the projection, in the norm of the kinetic energy, of the velocities before on those that let no contact
-    approach: v + M⁻¹Hᵀp with p = argmin ‖M^½ v + M^-½ Hᵀ p‖ over p ≥ 0, by a method whose answers are certified.
+    They are the projection, in the norm of the kinetic energy, of the velocities before on those
+    that let no contact
+    approach: v + M⁻¹Hᵀp with p = argmin ‖M^½ v + M^-½ Hᵀ p‖ over p ≥ 0, by a method whose answers
+      are certified.
     """
-    matrix, roots = incidence(network, len(masses))[np.asarray(network.used)], np.repeat(np.sqrt(masses), 2)
+    matrix, roots = (
+        incidence(network, len(masses))[np.asarray(network.used)],
+        np.repeat(np.sqrt(masses), 2),
+    )
     impulses = certified_impulses(matrix / roots, matrix @ velocities.ravel())
     assert impulses is not None  # grains at rest satisfy all contacts
     return velocities + (matrix.T @ impulses / roots**2).reshape(-1, 2)
@@ -62,7 +69,11 @@ def padded_network(i, j, normals, approach, masses, slots: int = MAX_CONTACTS) -
 
     def pad(values, fill=0.0):
         values = np.asarray(values)
-        return jnp.asarray(np.concatenate([values, np.full((slots - count, *values.shape[1:]), fill, values.dtype)]))
+        return jnp.asarray(
+            np.concatenate(
+                [values, np.full((slots - count, *values.shape[1:]), fill, values.dtype)]
+            )
+        )
 
     i, j = np.asarray(i, np.int32), np.asarray(j, np.int32)
     masses = np.asarray(masses, float)
@@ -78,14 +89,18 @@ def padded_network(i, j, normals, approach, masses, slots: int = MAX_CONTACTS) -
     )
 
 
-def random_network(seed: int, discs: int, heaviest: float = 100.0) -> tuple[Contacts, np.ndarray, np.ndarray]:
+def random_network(
+    seed: int, discs: int, heaviest: float = 100.0
+) -> tuple[Contacts, np.ndarray, np.ndarray]:
     """Contacts of a cluster of discs with random masses and velocities.
 
-    The discs are the first sites of a triangular lattice around the origin, displaced at random; contacts join the
-    neighbours on it, some of them left out. So there are at most 3 contacts per disc, as between hard discs.
+    The discs are the first sites of a triangular lattice around the origin, displaced at random;
+    contacts join the neighbours on it, some of them left out. So there are at most 3 contacts per
+    disc, as between hard discs.
 
     Returns:
-      The network, the masses (60,) and the velocities (60, 2) that its approach velocities come from.
+      The network, the masses (60,) and the velocities (60, 2) that its approach velocities come
+      from.
     """
     rng = np.random.default_rng(seed)
     a, b = (axis.ravel() for axis in np.meshgrid(np.arange(-6, 7), np.arange(-6, 7)))
@@ -96,7 +111,9 @@ def random_network(seed: int, discs: int, heaviest: float = 100.0) -> tuple[Cont
     i, j = i[keep], j[keep]
     sites = sites + rng.uniform(-0.15, 0.15, sites.shape)
     masses = heaviest ** rng.uniform(0, 1, MAX_DISCS)
-    velocities = rng.normal(size=(MAX_DISCS, 2)) - rng.uniform(0, 2) * sites  # some of them rush together
+    velocities = (
+        rng.normal(size=(MAX_DISCS, 2)) - rng.uniform(0, 2) * sites
+    )  # some of them rush together
     normals = sites[i] - sites[j]
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     approach = np.sum(normals * (velocities[i] - velocities[j]), axis=1)
@@ -123,11 +140,19 @@ def move(hood: PairLists, grains: Grains, side, displacements, strain):
 def listed_pairs(listed) -> set:
     """The pairs of a list, each once."""
     i, j, reach = (np.asarray(x) for x in (listed.i, listed.j, listed.reach))
-    found = [tuple(sorted(pair)) for pair in zip(i[reach > 0].tolist(), j[reach > 0].tolist(), strict=True)]
+    found = [
+        tuple(sorted(pair))
+        for pair in zip(i[reach > 0].tolist(), j[reach > 0].tolist(), strict=True)
+    ]
     assert len(found) == len(set(found))
     assert all(i != j for i, j in found)
     return set(found)
 
 
 def pairs_within(gap: float, positions, radii, side, tilt) -> set:
-    return set(zip(*(axis.tolist() for axis in np.nonzero(gaps_of(positions, radii, side, tilt) <= gap)), strict=True))
+    return set(
+        zip(
+            *(axis.tolist() for axis in np.nonzero(gaps_of(positions, radii, side, tilt) <= gap)),
+            strict=True,
+        )
+    )

@@ -17,20 +17,32 @@ from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 
-MARKUP = '<script>window.hacked = 1</script><img src=x onerror="window.hacked = 2">&amp; <b>bold</b>'
+MARKUP = (
+    '<script>window.hacked = 1</script><img src=x onerror="window.hacked = 2">&amp; <b>bold</b>'
+)
 """An attribute that would run as a script, if it were markup."""
 
 _OPTIONS = (
-    "--headless=new --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
-    "--disable-component-update --disable-sync --hide-scrollbars --window-size=1400,1400 --force-device-scale-factor=1"
+    "--headless=new --no-sandbox --disable-gpu --disable-quic --no-first-run "
+    "--disable-background-networking "
+    "--disable-component-update --disable-sync --hide-scrollbars --window-size=1400,1400 "
+    "--force-device-scale-factor=1"
 )
 
 
 @cache
 def page_map() -> xr.DataTree:
-    """A map of 2 time steps × 2 × 3 points: one is bad, one was not run, and names and attributes hold markup."""
+    """A map of 2 time steps × 2 × 3 points: one is bad, one was not run, and names and attributes
+    hold markup.
+    """
     settings = MapSettings(
-        (0.5, 0.7, 0.9), (0.5, 0.6), grains=64, seeds=2, timestep=(1e-3, 5e-4), strain=2.0, snapshots=True
+        (0.5, 0.7, 0.9),
+        (0.5, 0.6),
+        grains=64,
+        seeds=2,
+        timestep=(1e-3, 5e-4),
+        strain=2.0,
+        snapshots=True,
     )
     rng, flows = np.random.default_rng(0), settings.flows()
     results = {}
@@ -48,8 +60,12 @@ def page_map() -> xr.DataTree:
 
 @contextmanager
 def browser() -> Iterator[Any]:
-    """Chromium by Selenium, without a network; a test that needs it is skipped where there is none."""
-    webdriver = pytest.importorskip("selenium.webdriver", reason="browser tests need Selenium: pip install selenium.")
+    """Chromium by Selenium, without a network; a test that needs it is skipped where there is
+    none.
+    """
+    webdriver = pytest.importorskip(
+        "selenium.webdriver", reason="browser tests need Selenium: pip install selenium."
+    )
     binary, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if binary is None or driver is None:
         pytest.skip("browser tests need Chromium: apt-get install chromium chromium-driver.")
@@ -63,7 +79,12 @@ def browser() -> Iterator[Any]:
         try:
             chromium.set_script_timeout(30)
             chromium.execute_cdp_cmd("Network.enable", {})
-            offline = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
+            offline = {
+                "offline": True,
+                "latency": 0,
+                "downloadThroughput": 0,
+                "uploadThroughput": 0,
+            }
             chromium.execute_cdp_cmd("Network.emulateNetworkConditions", offline)
             still = {"name": "prefers-reduced-motion", "value": "reduce"}
             chromium.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [still]})
@@ -80,4 +101,6 @@ def open_page(chromium: Any, path: Path, address: str = "") -> None:
 
     chromium.get("about:blank")  # or another address of the same page would not load it again
     chromium.get(f"{path.as_uri()}{address}")
-    WebDriverWait(chromium, 30, 0.05).until(lambda _: chromium.execute_script("return document.body?.dataset.ready"))
+    WebDriverWait(chromium, 30, 0.05).until(
+        lambda _: chromium.execute_script("return document.body?.dataset.ready")
+    )

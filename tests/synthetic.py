@@ -1,4 +1,6 @@
-"""Made-up tallies, replicas and snapshots, for tests of what happens to the numbers after the flow."""
+"""Made-up tallies, replicas and snapshots, for tests of what happens to the numbers after the
+flow.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,12 +21,24 @@ from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.sample import BLOCKS, Sample
 
-SNAPSHOTS = 1000  # a static choice, the same wherever snapshots of a flow are taken: one compilation
+SNAPSHOTS = (
+    1000  # a static choice, the same wherever snapshots of a flow are taken: one compilation
+)
 
 
 def random_tally(rng: np.random.Generator, *shape: int, status: int = 0) -> Tally:
-    """Return a tally of positive random sums, of whole numbers of steps and contacts, with any leading axes."""
-    counts = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "iterations", "unconverged")
+    """Return a tally of positive random sums, of whole numbers of steps and contacts, with any
+    leading axes.
+    """
+    counts = (
+        "steps",
+        "contacts",
+        "loaded_contacts",
+        "collisions",
+        "solves",
+        "iterations",
+        "unconverged",
+    )
     values = {}
     for name in TABLE:
         tail = (2, 2) if name.endswith("moment") else ()
@@ -35,14 +49,20 @@ def random_tally(rng: np.random.Generator, *shape: int, status: int = 0) -> Tall
     return Tally(**{**values, "status": np.full(shape, status, np.int32)})
 
 
-def random_replica(rng: np.random.Generator, settings: MapSettings, status: int = Status.ok, point: int = 0) -> Replica:
-    """Return a replica of a map with random sums, the same area for all and a strain of 3 before the sample."""
+def random_replica(
+    rng: np.random.Generator, settings: MapSettings, status: int = Status.ok, point: int = 0
+) -> Replica:
+    """Return a replica of a map with random sums, the same area for all and a strain of 3 before
+    the sample.
+    """
     tally, grains = random_tally(rng, BLOCKS, status=status), settings.flows()[point].grains
     return Replica(Sample(tally, np.float64(100.0), np.float64(1.0), grains), int(status), 3.0)
 
 
 def random_instant(seed: int, grains: int = 20, pairs: int = 7) -> Instant:
-    """Return an instant of grains at random places in a cell of side 10, with pairs of random forces."""
+    """Return an instant of grains at random places in a cell of side 10, with pairs of random
+    forces.
+    """
     rng = np.random.default_rng(seed)
     return Instant(
         positions=rng.uniform(-5, 5, (grains, 2)),
@@ -60,8 +80,13 @@ def random_state(seed: int, grains: int = 20, side: float = 10.0) -> State:
     """Return grains of random sizes and velocities at random places of a cell."""
     rng = np.random.default_rng(seed)
     radii = rng.uniform(0.3, 0.7, grains)
-    positions, velocities = rng.uniform(-side / 2, side / 2, (grains, 2)), rng.normal(size=(grains, 2))
-    return State(Grains(radii, 4 * radii**2), positions, velocities, np.float64(side), np.float64(0.2))
+    positions, velocities = (
+        rng.uniform(-side / 2, side / 2, (grains, 2)),
+        rng.normal(size=(grains, 2)),
+    )
+    return State(
+        Grains(radii, 4 * radii**2), positions, velocities, np.float64(side), np.float64(0.2)
+    )
 
 
 def one_sentence(message: str) -> bool:
@@ -71,14 +96,20 @@ def one_sentence(message: str) -> bool:
 
 @contextmanager
 def refused(words: str = ".") -> Iterator[pytest.ExceptionInfo]:
-    """What a user gives is refused by an ``InputError`` of one sentence, in which the words are found."""
+    """What a user gives is refused by an ``InputError`` of one sentence, in which the words are
+    found.
+    """
     with pytest.raises(InputError, match=words) as caught:
         yield caught
     assert one_sentence(str(caught.value))
 
 
-def snapshot_of(positions, contacts=None, velocities=None, radii=0.5, side=40.0, tilt=0.0, shear_rate=1.0) -> Snapshot:
-    """Snapshots of grains at (times, grains, 2), with contacts (i, j, impulse) of each time, at unit time step."""
+def snapshot_of(
+    positions, contacts=None, velocities=None, radii=0.5, side=40.0, tilt=0.0, shear_rate=1.0
+) -> Snapshot:
+    """Snapshots of grains at (times, grains, 2), with contacts (i, j, impulse) of each time, at
+    unit time step.
+    """
     positions = np.asarray(positions, float)
     times, grains = positions.shape[:2]
     radii = np.broadcast_to(np.asarray(radii, float), (times, grains))
@@ -91,15 +122,29 @@ def snapshot_of(positions, contacts=None, velocities=None, radii=0.5, side=40.0,
             i[t, k], j[t, k], impulses[t, k], used[t, k] = a, b, p, True
     time = np.arange(times)[:, None]
     branch = (
-        np.stack([minimum_image(r[a] - r[b], side, tilt) for r, a, b in zip(positions, i, j, strict=True)])
+        np.stack(
+            [
+                minimum_image(r[a] - r[b], side, tilt)
+                for r, a, b in zip(positions, i, j, strict=True)
+            ]
+        )
         + np.where(used, 0, 1)[..., None]
     )
     distances = np.linalg.norm(branch, axis=-1)
     every = np.ones(times)
     masses = 4 * radii**2
     network = Contacts(
-        i, j, branch / distances[..., None], distances, -impulses, 1 / masses[time, i], 1 / masses[time, j], used
+        i,
+        j,
+        branch / distances[..., None],
+        distances,
+        -impulses,
+        1 / masses[time, i],
+        1 / masses[time, j],
+        used,
     )
     velocities = np.zeros_like(positions) if velocities is None else velocities
     state = State(Grains(radii, masses), positions, velocities, side * every, tilt * every)
-    return Snapshot(state, network, impulses, every, shear_rate * every, 0.5 * every, 0 * time[:, 0])
+    return Snapshot(
+        state, network, impulses, every, shear_rate * every, 0.5 * every, 0 * time[:, 0]
+    )

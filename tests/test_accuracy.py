@@ -1,4 +1,6 @@
-"""The choice of time step: against temperatures of other programs and the charts that it was read off."""
+"""The choice of time step: against temperatures of other programs and the charts that it was read
+off.
+"""
 
 import json
 from pathlib import Path
@@ -17,7 +19,8 @@ from jaxgran.sampling.timestep import (
 )
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
-# (packing fraction, restitution): temperature of event-driven hard discs, and of soft ones in the stiff limit
+# (packing fraction, restitution): temperature of event-driven hard discs, and of soft ones in the
+# stiff limit
 TEMPERATURES = {
     (0.20, 0.9): 10.92,
     (0.20, 0.7): 3.105,
@@ -42,18 +45,31 @@ def test_expected_temperature_is_within_a_factor_of_two_of_other_programs() -> N
 
 def test_expected_temperature_scales_with_the_square_of_the_shear_rate() -> None:
     flow, faster = (stack([ShearFlow(64, 0.5, 0.8, 1e-5, shear_rate=rate)]) for rate in (1.0, 2.0))
-    cold, hot = (expected_temperature(predicted(f).granular_temperature, 0.8, f.shear_rate) for f in (flow, faster))
+    cold, hot = (
+        expected_temperature(predicted(f).granular_temperature, 0.8, f.shear_rate)
+        for f in (flow, faster)
+    )
     np.testing.assert_allclose(hot, 4 * cold, rtol=1e-6)
 
 
 @pytest.mark.parametrize("activation", ["midpoint", "touching"])
 def test_time_steps_shorten_with_heat_with_density_and_with_the_error_asked_for(activation) -> None:
     nu = np.linspace(0.1, 0.83, 20)
-    for steps in (longest_timestep(1.0, nu, activation), automatic_timestep(1.0, nu, activation, 1e-3)):
+    for steps in (
+        longest_timestep(1.0, nu, activation),
+        automatic_timestep(1.0, nu, activation, 1e-3),
+    ):
         assert np.all(np.diff(steps) <= 0) and steps[-1] > 0
-    np.testing.assert_allclose(longest_timestep(4.0, nu, activation), longest_timestep(1.0, nu, activation) / 2)
-    assert np.all(automatic_timestep(1.0, nu, activation, 1e-3) < automatic_timestep(1.0, nu, activation, 1e-2))
-    assert np.all(automatic_timestep(1.0, nu, activation, 0.1) <= longest_timestep(1.0, nu, activation))
+    np.testing.assert_allclose(
+        longest_timestep(4.0, nu, activation), longest_timestep(1.0, nu, activation) / 2
+    )
+    assert np.all(
+        automatic_timestep(1.0, nu, activation, 1e-3)
+        < automatic_timestep(1.0, nu, activation, 1e-2)
+    )
+    assert np.all(
+        automatic_timestep(1.0, nu, activation, 0.1) <= longest_timestep(1.0, nu, activation)
+    )
     assert np.all(longest_timestep(1.0, nu, "touching") < longest_timestep(1.0, nu, "midpoint"))
 
 
@@ -69,5 +85,9 @@ def test_errors_of_the_committed_chart_of_whole_runs_are_within_the_bound_and_it
             bound = stress_error(crossing, flow["packing_fraction"])
             for name in ("pressure", "shear_stress"):
                 error, noise = row["errors"][name]
-                assert abs(error) < bound + 3 * noise + 0.01, (flow["packing_fraction"], row["timestep"], name)
+                assert abs(error) < bound + 3 * noise + 0.01, (
+                    flow["packing_fraction"],
+                    row["timestep"],
+                    name,
+                )
     assert compared > 2 * len(chart["flows"])

@@ -1,4 +1,6 @@
-"""Bad input of any kind ends with one sentence that says what is accepted: nothing runs, and no file is left behind."""
+"""Bad input of any kind ends with one sentence that says what is accepted: nothing runs, and no
+file is left behind.
+"""
 
 import inspect
 import os
@@ -19,7 +21,14 @@ import numpy as np
 import pytest
 import scipy.sparse
 import xarray as xr
-from command_line import POINTS, assert_one_sentence, files, jaxgran, made_up_replicas, write_few_variables
+from command_line import (
+    POINTS,
+    assert_one_sentence,
+    files,
+    jaxgran,
+    made_up_replicas,
+    write_few_variables,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_maps import ratio_dataset, with_timesteps
@@ -189,7 +198,9 @@ NEVER: list[Any] = [  # no argument of any function
 def test_what_can_be_no_argument_is_refused_in_one_sentence(argument: str) -> None:
     function = {**NUMBERS, **OBJECTS}[argument]
     for value in NEVER:
-        suits = (value is SEEN and argument == "fields_at seen") or (value is KEYS and argument == "prepare key")
+        suits = (value is SEEN and argument == "fields_at seen") or (
+            value is KEYS and argument == "prepare key"
+        )
         suits |= argument == "ratio_map attributes" and isinstance(value, dict)
         if not suits:
             assert verdict(function, value)
@@ -219,7 +230,10 @@ def test_lists_of_numbers_stand_for_arrays() -> None:
 def test_what_jax_cannot_trace_in_observe_is_refused_with_its_line(number: Callable) -> None:
     line = number.__code__.co_firstlineno
     refusal = verdict(lambda x: observed_shapes(x, flow()), number)
-    assert refusal.startswith("observe must compute with jax.numpy") and f"line {line}, 'lambda seen" in refusal
+    assert (
+        refusal.startswith("observe must compute with jax.numpy")
+        and f"line {line}, 'lambda seen" in refusal
+    )
 
 
 SEVERAL = jax.tree.map(lambda x: np.stack([x, x]), SEEN)
@@ -252,7 +266,9 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "grains must be a whole number of at least 16, not 15": lambda: make_flow("grains", 15),
     "at most 10000000, as memory is limited": lambda: make_flow("grains", 10**12),
     "restitution must be between 0 and 1, not 1.1": lambda: make_flow("restitution", 1.1),
-    "packing_fraction must be above 0 and at most 0.83": lambda: make_flow("packing_fraction", 0.831),
+    "packing_fraction must be above 0 and at most 0.83": lambda: make_flow(
+        "packing_fraction", 0.831
+    ),
     "timestep must be a positive number": lambda: make_flow("timestep", 0.0),
     "timestep must be at most 0.1 / shear_rate": lambda: make_flow("timestep", 0.2),
     "shear_rate must be a number of at least 0": lambda: make_flow("shear_rate", -1e-9),
@@ -263,8 +279,12 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "diameters must be a list of positive numbers": lambda: jg.own_grains([1.0, -1.0]),
     "masses must be a list of positive numbers": lambda: jg.own_grains([1.0, 2.0], [1.0, np.inf]),
     "as many masses as diameters, and there are 1 and 2": lambda: jg.own_grains([1.0, 2.0], [1.0]),
-    "radii and masses of 32 discs": lambda: jg.pack(flow(), KEY, jg.own_grains(np.ones(GRAINS + 1))),
-    "mean diameter must be 1, the unit of": lambda: jg.pack(flow(), KEY, jg.Grains(0.7 * HALF, HALF)),
+    "radii and masses of 32 discs": lambda: jg.pack(
+        flow(), KEY, jg.own_grains(np.ones(GRAINS + 1))
+    ),
+    "mean diameter must be 1, the unit of": lambda: jg.pack(
+        flow(), KEY, jg.Grains(0.7 * HALF, HALF)
+    ),
     "of shapes": lambda: jg.pack(flow(), KEY, jg.Grains(HALF, jnp.ones(3))),
     "grains must be Grains": lambda: jg.heated(flow(), KEY, grains=0.5),
     # preparation, sample, snapshots
@@ -274,7 +294,9 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "at most 2147483647 time steps": lambda: jg.sample(flow(), SEEN.state, 1e30),
     "one State of 64 grains": lambda: jg.sample(make_flow("grains", 64), SEEN.state, 1.0),
     "a whole number of 0 to 2147483647": lambda: jg.advance(flow(), SEEN.state, 2**31),
-    "callback must be a function or None": lambda: jg.sample(flow(), SEEN.state, 1.0, callback="tell"),
+    "callback must be a function or None": lambda: jg.sample(
+        flow(), SEEN.state, 1.0, callback="tell"
+    ),
     "count must be at most": lambda: jg.snapshot_series(flow(), SEEN.state, 1.0, 10**9),
     "strain must be": lambda: jg.snapshot_series(flow(), SEEN.state, 1e-3, 5),
     "observe must return sums over the contacts": lambda: observing(lambda seen: seen.impulses),
@@ -304,7 +326,9 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "impulses must be an array (2,)": lambda: contact_residuals(EVEN, np.zeros(1)),
     # maps
     "must be a list without repetition, in any": lambda: make_map("restitution", (0.5, 0.9, 0.5)),
-    "restitution must be a list of numbers": lambda: make_map("restitution", ((0.1, 0.5), (0.7, 0.9))),
+    "restitution must be a list of numbers": lambda: make_map(
+        "restitution", ((0.1, 0.5), (0.7, 0.9))
+    ),
     "without repetition": lambda: make_map("grains", (64, 64)),
     "at most 1000000 replicas, points times seeds": lambda: make_map("seeds", 600_000),
     "first_seed must be a whole number of at least 0": lambda: make_map("first_seed", -1),
@@ -322,10 +346,16 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "part must be K/N": lambda: make_map("part", "4/3"),
     "length divides the number of grains, 32": lambda: map_of(diameters=[1.0, 1.4, 2.0]),
     "the largest diameter": lambda: map_of(diameters=LAST),
-    "polydispersity must be left out where": lambda: map_of(diameters=[1.0, 2.0], polydispersity=0.1),
+    "polydispersity must be left out where": lambda: map_of(
+        diameters=[1.0, 2.0], polydispersity=0.1
+    ),
     "names without spaces and signs": lambda: make_map("observe", lambda _: {"of all": 1.0}),
-    "names that a map does not have, not 'pressure'": lambda: make_map("observe", lambda _: {"pressure": 1.0}),
-    "must return a dictionary of numbers": lambda: make_map("observe", lambda seen: seen.state.side),
+    "names that a map does not have, not 'pressure'": lambda: make_map(
+        "observe", lambda _: {"pressure": 1.0}
+    ),
+    "must return a dictionary of numbers": lambda: make_map(
+        "observe", lambda seen: seen.state.side
+    ),
     "names that a map does not have, not 'seeds'": lambda: make_map("attributes", {"seeds": 7}),
     "workers must be": lambda: make_map("workers", 0),
     "output must be": lambda: make_map("output", "map.txt"),
@@ -337,11 +367,15 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "maps must be a list of at least one map or file": lambda: jg.merge_maps("map.nc"),
     # fields, figures, pages, files
     "is the last one of a series": lambda: jg.fields_at(SEVERAL, POINT, jg.gaussian(1.0)),
-    "positive and at most 0.456 in this cell": lambda: jg.fields_at(SEEN, POINT, jg.gaussian(1e308)),
+    "positive and at most 0.456 in this cell": lambda: jg.fields_at(
+        SEEN, POINT, jg.gaussian(1e308)
+    ),
     "it has no packing_fraction, restitution, force_": lambda: jg.ratio_curves(xr.Dataset()),
     "it has no pressure, theory/pressure": lambda: jg.theory_errors(ratio_dataset()),
     "has 5 and 1": lambda: jg.ratio_contours(ratio_dataset(5, 1)),
-    "at least two time steps, and this map has 1": lambda: jg.ratio_against_timestep(ratio_dataset()),
+    "at least two time steps, and this map has 1": lambda: jg.ratio_against_timestep(
+        ratio_dataset()
+    ),
     "at least two numbers of grains, and this": lambda: jg.averages_against_grains(ratio_dataset()),
     "format must be": lambda: jg.save_figures(ratio_dataset(), "map", format="gif"),
     "dpi must be": lambda: jg.save_figures(ratio_dataset(), "map", dpi=49),
@@ -357,7 +391,9 @@ REFUSED: dict[str, Callable[[], Any]] = {
     ),
     "path must be a file name": lambda: jg.read_trajectory(3),
     "there is no file": lambda: jg.read_trajectory("none.gsd"),
-    "have shapes that broadcast, not (2,) and (3,)": lambda: jg.validity([0.5, 0.6], [0.5, 0.6, 0.7]),
+    "have shapes that broadcast, not (2,) and (3,)": lambda: jg.validity(
+        [0.5, 0.6], [0.5, 0.6, 0.7]
+    ),
 }
 
 
@@ -395,7 +431,13 @@ NO_MAPS: dict[str, xr.Dataset] = {
 @pytest.mark.parametrize("kind", NO_MAPS)
 def test_what_is_no_map_is_refused_by_every_figure_and_as_a_file(kind: str, tmp_path: Path) -> None:
     data = NO_MAPS[kind]
-    for draw in (jg.ratio_curves, jg.ratio_contours, jg.ratio_against_timestep, jg.theory_errors, jg.cluster_shares):
+    for draw in (
+        jg.ratio_curves,
+        jg.ratio_contours,
+        jg.ratio_against_timestep,
+        jg.theory_errors,
+        jg.cluster_shares,
+    ):
         assert "must be a ratio map" in verdict(draw, data)
     assert "must be a ratio map" in verdict(lambda x: jg.save_figures(x, tmp_path / "map"), data)
     data.to_netcdf(tmp_path / "no.nc", engine="netcdf4")
@@ -439,14 +481,25 @@ ALIKE = {
     [
         ("grains", "many"),
         ("strain", [1.0, 2.0]),
-        *[(name, "other") for name in ("solver_requested", "activation", "engine_requested", "equilibrate")],
+        *[
+            (name, "other")
+            for name in ("solver_requested", "activation", "engine_requested", "equilibrate")
+        ],
         *[("solver_parameters", value) for value in ("{", '{"damping": 1.0}')],
         ("first_seed", None),  # it is missing
     ],
 )
-def test_a_map_with_impossible_choices_cannot_be_repeated(name: str, value: Any, tmp_path: Path) -> None:
+def test_a_map_with_impossible_choices_cannot_be_repeated(
+    name: str, value: Any, tmp_path: Path
+) -> None:
     data = ratio_dataset(alphas=2, nus=2)
-    attrs = {**data.attrs, "restitution": [0.1, 0.9], "packing_fraction": [0.3, 0.8], **ALIKE, name: value}
+    attrs = {
+        **data.attrs,
+        "restitution": [0.1, 0.9],
+        "packing_fraction": [0.3, 0.8],
+        **ALIKE,
+        name: value,
+    }
     told = {key: one for key, one in attrs.items() if one is not None}
     data.drop_attrs(deep=False).assign_attrs(told).to_netcdf(tmp_path / "old.nc", engine="netcdf4")
     outcome = jaxgran(tmp_path, "map", "--from-map", "old.nc", "--output", "new.nc")
@@ -462,9 +515,13 @@ def test_a_map_with_impossible_choices_cannot_be_repeated(name: str, value: Any,
 def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
     name: str, tmp_path: Path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
+    monkeypatch.setattr(
+        ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok})
+    )
     write_few_variables(monkeypatch, *theory.SHARES)
-    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"a picture"))
+    monkeypatch.setattr(
+        Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"a picture")
+    )
     for drawing in ("curves", "clusters"):
         monkeypatch.setitem(FIGURES, drawing, FIGURES[drawing]._replace(draw=lambda _: Figure()))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", f"--output={name}")
@@ -488,7 +545,9 @@ OUTPUTS = {
 
 
 @pytest.mark.parametrize("output", OUTPUTS, ids=lambda x: f"{x[:20]}-{len(x)}-{x.count('/')}")
-def test_an_output_that_cannot_be_written_is_refused_before_anything_runs(output: str, tmp_path: Path) -> None:
+def test_an_output_that_cannot_be_written_is_refused_before_anything_runs(
+    output: str, tmp_path: Path
+) -> None:
     (tmp_path / "folder.nc").mkdir()
     (tmp_path / "file.txt").write_text("no folder")
     (tmp_path / "taken.nc.unfinished").write_text("no folder")
@@ -505,7 +564,11 @@ def test_a_folder_that_is_read_only_and_a_file_that_is_secret_are_refused(tmp_pa
     ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="netcdf4")
     tmp_path.chmod(0o500)
     try:
-        for words in (["plot", "map.nc"], ["map", "--output", "new.nc"], [*RUN, "--output", "new.nc"]):
+        for words in (
+            ["plot", "map.nc"],
+            ["map", "--output", "new.nc"],
+            [*RUN, "--output", "new.nc"],
+        ):
             assert_one_sentence(jaxgran(tmp_path, *words))
         (tmp_path / "map.nc").chmod(0)
         for words in (["plot", "map.nc"], ["map", "--from-map", "map.nc"]):
@@ -515,7 +578,9 @@ def test_a_folder_that_is_read_only_and_a_file_that_is_secret_are_refused(tmp_pa
     assert files(tmp_path) == {"map.nc"}
 
 
-def test_a_file_system_that_fails_while_figures_are_drawn_is_one_sentence(tmp_path: Path, monkeypatch) -> None:
+def test_a_file_system_that_fails_while_figures_are_drawn_is_one_sentence(
+    tmp_path: Path, monkeypatch
+) -> None:
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -530,7 +595,9 @@ def test_a_file_system_that_fails_while_figures_are_drawn_is_one_sentence(tmp_pa
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a system without a full device")
-@pytest.mark.parametrize("words", ["where --restitution 0.5 --packing-fraction 0.6", "--version", "--help"])
+@pytest.mark.parametrize(
+    "words", ["where --restitution 0.5 --packing-fraction 0.6", "--version", "--help"]
+)
 def test_a_full_disk_under_the_output_is_one_sentence(words: str) -> None:
     command = [sys.executable, "-m", "jaxgran", *words.split()]
     with open("/dev/full", "w") as full:

@@ -1,4 +1,6 @@
-"""A replica has the same results wherever its batch runs: on one device, on several, or on those of several hosts."""
+"""A replica has the same results wherever its batch runs: on one device, on several, or on those of
+several hosts.
+"""
 
 import os
 import socket
@@ -24,19 +26,22 @@ PROGRAM = Path(__file__).with_name("devices.py")
 RESTITUTIONS = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9)  # more than four devices, and not a multiple
 STEPS = (120, 90, 60, 0, 120, 30)
 
-WAVES = (
-    f"arr_{len(fields(State)) + len(fields(Grains)) - 1 + list(TABLE).index('wave_kinetic')}"  # as NumPy names leaves
-)
+# as NumPy names leaves
+WAVES = f"arr_{len(fields(State)) + len(fields(Grains)) - 1 + list(TABLE).index('wave_kinetic')}"
 
 
 def lattice(packing_fraction: float, seed: int) -> State:
-    """Grains at rest on a square lattice, moved and thrown a little: they collide within some steps."""
+    """Grains at rest on a square lattice, moved and thrown a little: they collide within some
+    steps.
+    """
     rng, grains = np.random.default_rng(seed), own_grains(np.ones(GRAINS))
     side = np.sqrt(np.pi / 4 * GRAINS / packing_fraction)
     rows = int(np.ceil(np.sqrt(GRAINS)))
     places = np.stack(np.divmod(np.arange(GRAINS), rows), axis=-1) * side / rows
     velocities = 3 * rng.normal(size=places.shape)
-    return State(grains, jnp.asarray(places), jnp.asarray(velocities), jnp.asarray(side), jnp.asarray(0.0))
+    return State(
+        grains, jnp.asarray(places), jnp.asarray(velocities), jnp.asarray(side), jnp.asarray(0.0)
+    )
 
 
 @pytest.fixture
@@ -61,7 +66,9 @@ def test_results_on_four_devices_are_those_on_one_to_the_bit(batch: Path) -> Non
 
 @pytest.mark.environment
 def test_results_in_lockstep_on_four_devices_are_those_on_one_to_the_bit(batch: Path) -> None:
-    """As on accelerators: ``vmap`` over the replicas of a device. Waves are equal to the rounding of a cosine."""
+    """As on accelerators: ``vmap`` over the replicas of a device. Waves are equal to the rounding
+    of a cosine.
+    """
     _run(batch, "one.npz", 1, "lockstep")
     _run(batch, "four.npz", 4, "lockstep")
     _assert_same(batch / "four.npz", batch / "one.npz", rounded=WAVES)
@@ -88,7 +95,9 @@ def _assert_same(one: Path, other: Path, rounded: str = "") -> None:
         assert these.files == those.files
         for name in these.files:
             if name == rounded:
-                np.testing.assert_allclose(these[name], those[name], rtol=4 * np.finfo(float).eps, atol=0)
+                np.testing.assert_allclose(
+                    these[name], those[name], rtol=4 * np.finfo(float).eps, atol=0
+                )
             else:
                 np.testing.assert_array_equal(these[name], those[name])
 
@@ -96,7 +105,9 @@ def _assert_same(one: Path, other: Path, rounded: str = "") -> None:
 def _start(folder: Path, output: str, devices: int, *words: str) -> subprocess.Popen:
     # The sums of the older emitter depend on what else is in an array; users have the newer one.
     flags = os.environ["XLA_FLAGS"].replace("fusion_emitters=false", "fusion_emitters=true")
-    environment = os.environ | {"XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count={devices}"}
+    environment = os.environ | {
+        "XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count={devices}"
+    }
     command = [sys.executable, str(PROGRAM), "start.npz", output, str(GRAINS), *words]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=folder, env=environment, **streams)

@@ -1,4 +1,6 @@
-"""A plain ``vmap`` is the best way by itself: each replica has the bits it has alone, however it is transformed."""
+"""A plain ``vmap`` is the best way by itself: each replica has the bits it has alone, however it is
+transformed.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,14 +29,20 @@ def states(flowing) -> jg.State:
 
 
 def compiled(function: Callable) -> Callable:
-    """The function compiled as users have it: sums of loops by the older emitter depend on what else is computed."""
+    """The function compiled as users have it: sums of loops by the older emitter depend on what
+    else is computed.
+    """
     return lambda *x: jax.jit(function).lower(*x).compile({"xla_cpu_use_fusion_emitters": True})(*x)
 
 
 def assert_same(one: tuple, other: tuple) -> None:
-    """The same bits, but for the energy of waves: the last bit of a cosine of XLA depends on the batch."""
+    """The same bits, but for the energy of waves: the last bit of a cosine of XLA depends on the
+    batch.
+    """
     np.testing.assert_allclose(one[1].wave_kinetic, other[1].wave_kinetic, rtol=1e-14)
-    assert_same_bits((one[0], replace(one[1], wave_kinetic=0)), (other[0], replace(other[1], wave_kinetic=0)))
+    assert_same_bits(
+        (one[0], replace(one[1], wave_kinetic=0)), (other[0], replace(other[1], wave_kinetic=0))
+    )
 
 
 def advanced(engine: jg.Jax | jg.Numba, alpha, state: jg.State) -> tuple:
@@ -48,7 +56,9 @@ def test_replicas_of_a_vmap_have_the_bits_of_each_alone(name: str, states) -> No
     of_one = compiled(run)
     together = compiled(jax.vmap(run))(ALPHAS, states)
     crossed = compiled(jax.vmap(jax.vmap(run, (0, None)), (None, 0)))(ALPHAS, states)
-    mapped = compiled(lambda alphas, states: lax.map(lambda one: run(*one), (alphas, states)))(ALPHAS, states)
+    mapped = compiled(lambda alphas, states: lax.map(lambda one: run(*one), (alphas, states)))(
+        ALPHAS, states
+    )
     for k in range(len(ALPHAS)):
         alone = of_one(ALPHAS[k], replica(states, k))
         for batch in (together, mapped, replica(crossed, k)):
@@ -56,18 +66,30 @@ def test_replicas_of_a_vmap_have_the_bits_of_each_alone(name: str, states) -> No
 
 
 def test_replicas_of_a_vmap_advance_one_after_another(states) -> None:
-    """With loops and conditions of their own, which an axis of replicas would turn into choices between branches."""
-    batched = jax.make_jaxpr(jax.vmap(lambda state: advance(flow_of(0.7), state, jnp.int32(STEPS), engine=jg.Jax())))
+    """With loops and conditions of their own, which an axis of replicas would turn into choices
+    between branches.
+    """
+    batched = jax.make_jaxpr(
+        jax.vmap(lambda state: advance(flow_of(0.7), state, jnp.int32(STEPS), engine=jg.Jax()))
+    )
     (call,) = batched(states).eqns
     names = [equation.primitive.name for equation in call.params["call_jaxpr"].eqns]
     assert names.count("scan") == 1 and not {"while", "select_n", "cond"} & {*names}
 
 
-def test_lockstep_has_the_bits_of_each_replica_alone_and_lowers_for_every_accelerator(states, monkeypatch) -> None:
+def test_lockstep_has_the_bits_of_each_replica_alone_and_lowers_for_every_accelerator(
+    states, monkeypatch
+) -> None:
     alone_of = compiled(partial(advanced, jg.Jax()))
     alone = [alone_of(alpha, replica(states, k)) for k, alpha in enumerate(ALPHAS)]
-    monkeypatch.setattr(engine_module, "default_device", lambda: SimpleNamespace(platform="accelerator"))
-    run = jax.vmap(lambda alpha, state: advance(replace(flow_of(0.7), restitution=alpha), state, jnp.int32(STEPS)))
+    monkeypatch.setattr(
+        engine_module, "default_device", lambda: SimpleNamespace(platform="accelerator")
+    )
+    run = jax.vmap(
+        lambda alpha, state: advance(
+            replace(flow_of(0.7), restitution=alpha), state, jnp.int32(STEPS)
+        )
+    )
     together = compiled(run)(ALPHAS, states)
     for k, one in enumerate(alone):
         assert_same(replica(together, k), one)
@@ -88,12 +110,16 @@ def test_forward_derivatives_follow_replicas(name: str, states) -> None:
     run = compiled(slope)
     alone = np.array([run(alpha, replica(states, k)) for k, alpha in enumerate(ALPHAS)])
     np.testing.assert_array_equal(compiled(jax.vmap(slope))(ALPHAS, states), alone)
-    by_vmap = compiled(lambda x: jax.jvp(lambda y: jax.vmap(speed)(y, states), (x,), (jnp.ones_like(x),))[1])
+    by_vmap = compiled(
+        lambda x: jax.jvp(lambda y: jax.vmap(speed)(y, states), (x,), (jnp.ones_like(x),))[1]
+    )
     np.testing.assert_allclose(by_vmap(ALPHAS), alone, rtol=1e-12)
     columns = compiled(jax.jacfwd(lambda x: jax.vmap(speed)(x, states)))(ALPHAS)
     np.testing.assert_allclose(columns, np.diag(alone), rtol=1e-12)
     step = 1e-6
-    numerical = (speed(ALPHAS[0] + step, replica(states, 0)) - speed(ALPHAS[0] - step, replica(states, 0))) / (2 * step)
+    numerical = (
+        speed(ALPHAS[0] + step, replica(states, 0)) - speed(ALPHAS[0] - step, replica(states, 0))
+    ) / (2 * step)
     np.testing.assert_allclose(alone[0], numerical, rtol=1e-4)
 
 
@@ -106,16 +132,20 @@ def test_reverse_mode_without_a_number_of_events_is_refused(states) -> None:
 def test_reverse_mode_of_a_batch_takes_the_number_of_events(states) -> None:
     def loss(alphas):
         flow = flow_of(0.7)
-        ends = jax.vmap(lambda a, s: advance(replace(flow, restitution=a), s, jnp.int32(STEPS), events=STEPS + 1)[0])(
-            alphas, states
-        )
+        ends = jax.vmap(
+            lambda a, s: advance(
+                replace(flow, restitution=a), s, jnp.int32(STEPS), events=STEPS + 1
+            )[0]
+        )(alphas, states)
         return jnp.sum(ends.velocities**2)
 
     def alone(alpha, state):
         flow = replace(flow_of(0.7), restitution=alpha)
         return jnp.sum(advance(flow, state, jnp.int32(STEPS), engine=jg.Jax())[0].velocities ** 2)
 
-    forward = [compiled(jax.jacfwd(alone))(alpha, replica(states, k)) for k, alpha in enumerate(ALPHAS)]
+    forward = [
+        compiled(jax.jacfwd(alone))(alpha, replica(states, k)) for k, alpha in enumerate(ALPHAS)
+    ]
     np.testing.assert_allclose(compiled(jax.grad(loss))(ALPHAS), forward, rtol=1e-6)
 
 
@@ -130,7 +160,9 @@ def test_a_share_of_the_replicas_on_each_device_has_the_same_bits(name: str, sta
 
 def test_a_sample_and_a_scan_advance_replicas_in_turn(states) -> None:
     def pressure(alpha, state):
-        return jg.sample(replace(flow_of(0.7), restitution=alpha), state, 0.1, blocks=2, engine=jg.Jax())[1].pressure
+        return jg.sample(
+            replace(flow_of(0.7), restitution=alpha), state, 0.1, blocks=2, engine=jg.Jax()
+        )[1].pressure
 
     def later(alpha, state):
         def step(state, _):

@@ -1,4 +1,6 @@
-"""All benchmarks are run by one command, their results are named once, and what the charts judge by is right."""
+"""All benchmarks are run by one command, their results are named once, and what the charts judge by
+is right.
+"""
 
 import inspect
 import subprocess
@@ -19,7 +21,9 @@ def committed() -> list[str]:
     """Names of the results under version control; all that are there where this is no checkout."""
     if not (ROOT / ".git").exists():
         return [file.name for file in output.RESULTS.iterdir()]
-    listed = subprocess.run(["git", "ls-files", "."], cwd=output.RESULTS, capture_output=True, text=True, check=True)
+    listed = subprocess.run(
+        ["git", "ls-files", "."], cwd=output.RESULTS, capture_output=True, text=True, check=True
+    )
     return listed.stdout.split()
 
 
@@ -41,9 +45,13 @@ def test_run_takes_the_options_of_the_registry(benchmark) -> None:
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_picture_of_a_result_has_the_width_of_a_column_or_two_and_text_that_can_be_read(name: str) -> None:
+def test_picture_of_a_result_has_the_width_of_a_column_or_two_and_text_that_can_be_read(
+    name: str,
+) -> None:
     figure = PICTURES[name]()
     figure.draw_without_rendering()
     assert figure.get_figwidth() * 2.54 in (pytest.approx(8.5), pytest.approx(17))
-    texts = [text for text in figure.findobj(Text) if text.get_text().strip() and text.get_visible()]
+    texts = [
+        text for text in figure.findobj(Text) if text.get_text().strip() and text.get_visible()
+    ]
     assert min(text.get_fontsize() for text in texts) >= 6.99

@@ -1,4 +1,6 @@
-"""Pages in a real browser: nothing fails, nothing is asked of a network, and what is clicked is what is shown."""
+"""Pages in a real browser: nothing fails, nothing is asked of a network, and what is clicked is
+what is shown.
+"""
 
 import json
 import shlex
@@ -40,7 +42,8 @@ def map_page(page) -> Any:
     """The page as it is when it is opened."""
     chromium, _ = page
     chromium.execute_script(
-        "Object.assign(chosen, {observable: names.indexOf('force_ratio'), timestep: 0, row: 0, column: 1});"
+        "Object.assign(chosen, {observable: names.indexOf('force_ratio'), timestep: 0, row: 0, "
+        "column: 1});"
         "Object.assign(chosen, {log: false, quotient: false}); draw()"
     )
     return chromium
@@ -93,7 +96,8 @@ def click_on(chromium, chart: str, x: float, y: float) -> None:
     div = chromium.find_element("id", chart)
     chromium.execute_script("arguments[0].scrollIntoView({block: 'center'})", div)
     across, down = chromium.execute_script(
-        "const {_fullLayout: layout} = element(arguments[0]), box = element(arguments[0]).getBoundingClientRect();"
+        "const {_fullLayout: layout} = element(arguments[0]), box = "
+        "element(arguments[0]).getBoundingClientRect();"
         "return [layout.xaxis._offset + layout.xaxis.d2p(arguments[1]) - box.width / 2,"
         " layout.yaxis._offset + layout.yaxis.d2p(arguments[2]) - box.height / 2]",
         chart,
@@ -114,8 +118,14 @@ def assert_quiet(chromium) -> None:
     """No message in the console, and no request but for the file of the page."""
     assert [entry["message"] for entry in chromium.get_log("browser")] == []
     events = [json.loads(entry["message"])["message"] for entry in chromium.get_log("performance")]
-    sent = [event["params"]["request"]["url"] for event in events if event["method"] == "Network.requestWillBeSent"]
-    asked = {url for url in sent if not url.startswith(("data:", "about:"))}  # pictures that Plotly makes are data
+    sent = [
+        event["params"]["request"]["url"]
+        for event in events
+        if event["method"] == "Network.requestWillBeSent"
+    ]
+    asked = {
+        url for url in sent if not url.startswith(("data:", "about:"))
+    }  # pictures that Plotly makes are data
     assert len(asked) == 1 and asked.pop().startswith("file:///")
 
 
@@ -131,7 +141,9 @@ def assert_table_is_that_of_the_dataset(chromium, **point: float) -> None:
     at, shown = page_map().sel(point), table(chromium)
     for name in ("force_ratio", "pressure", "granular_temperature"):
         value, error, _, theory, *_ = shown[name.replace("_", " ")]
-        assert float(value) == pytest.approx(float(at[name]), abs=0.051 * float(at[f"{name}_stderr"]))
+        assert float(value) == pytest.approx(
+            float(at[name]), abs=0.051 * float(at[f"{name}_stderr"])
+        )
         assert float(error) == pytest.approx(float(at[f"{name}_stderr"]), rel=0.05)
         if f"theory_{name}" in at:
             assert float(theory) == pytest.approx(float(at[f"theory_{name}"]), rel=5e-6)
@@ -140,8 +152,12 @@ def assert_table_is_that_of_the_dataset(chromium, **point: float) -> None:
 def test_map_opens_without_a_network_and_draws_every_point(page) -> None:
     chromium, _ = page
     assert_quiet(chromium)
-    drawn = chromium.execute_script("return document.querySelectorAll('#plane .scatterlayer path.point').length")
-    assert drawn == 6 + 1 + 1 + 1  # points, one of a bad status, one without a value, and the chosen one
+    drawn = chromium.execute_script(
+        "return document.querySelectorAll('#plane .scatterlayer path.point').length"
+    )
+    assert (
+        drawn == 6 + 1 + 1 + 1
+    )  # points, one of a bad status, one without a value, and the chosen one
     points = trace(chromium, "plane", "points")
     expected = [(round(1 - a, 12), nu) for nu in (0.5, 0.6) for a in (0.5, 0.7, 0.9)]
     assert list(zip(points["x"], points["y"], strict=True)) == expected
@@ -152,7 +168,12 @@ def test_names_and_attributes_stand_on_the_page_as_text(map_page) -> None:
     assert map_page.execute_script("return window.hacked") is None
     own = names(map_page).index("own <u>name</u>")
     choose(map_page, observable=own)
-    assert map_page.execute_script("return document.querySelectorAll('body u, body img, body b').length") == 0
+    assert (
+        map_page.execute_script(
+            "return document.querySelectorAll('body u, body img, body b').length"
+        )
+        == 0
+    )
     label = map_page.execute_script(
         "return element('plane').querySelector('.cbtitle, .cbtitle-unsupported')?.textContent"
     )
@@ -167,7 +188,12 @@ def test_click_on_a_point_shows_the_values_of_the_dataset(map_page) -> None:
     assert here(map_page) == {"timestep": 5e-4, "packing_fraction": 0.6, "restitution": 0.5}
     assert_table_is_that_of_the_dataset(map_page, **here(map_page))
     assert map_page.find_element("id", "which").text == "α = 0.5, ν = 0.6, N = 64, dt = 5e-4/γ̇"
-    click_on(map_page, "against-nu", 0.5, float(page_map().force_ratio.sel(here(map_page) | {"packing_fraction": 0.5})))
+    click_on(
+        map_page,
+        "against-nu",
+        0.5,
+        float(page_map().force_ratio.sel(here(map_page) | {"packing_fraction": 0.5})),
+    )
     wait_for(lambda: here(map_page)["packing_fraction"] == 0.5)
     assert_table_is_that_of_the_dataset(map_page, **here(map_page))
 
@@ -175,8 +201,14 @@ def test_click_on_a_point_shows_the_values_of_the_dataset(map_page) -> None:
 def test_curves_have_the_values_errors_and_theory_of_the_dataset(map_page) -> None:
     choose(map_page, observable=names(map_page).index("pressure"), timestep=1, row=1, column=0)
     at = page_map().sel(timestep=1e-3)
-    for chart, line in (("against-nu", at.sel(restitution=0.5)), ("against-alpha", at.sel(packing_fraction=0.6))):
-        measured, theory = trace(map_page, chart, "measured"), trace(map_page, chart, "kinetic theory")
+    for chart, line in (
+        ("against-nu", at.sel(restitution=0.5)),
+        ("against-alpha", at.sel(packing_fraction=0.6)),
+    ):
+        measured, theory = (
+            trace(map_page, chart, "measured"),
+            trace(map_page, chart, "kinetic theory"),
+        )
         np.testing.assert_allclose(measured["y"], line.pressure, rtol=5e-7)
         np.testing.assert_allclose(measured["error_y"]["array"], line.pressure_stderr, rtol=5e-7)
         np.testing.assert_allclose(theory["y"], line["theory/pressure"], rtol=5e-7)
@@ -217,8 +249,12 @@ def test_address_keeps_the_view(page, map_page) -> None:
     assert_quiet(chromium)
 
 
-def test_copied_are_the_table_and_a_command_that_runs(map_page, tmp_path: Path, monkeypatch) -> None:
-    map_page.execute_script("navigator.clipboard.writeText = async (text) => { window.copied = text; }")
+def test_copied_are_the_table_and_a_command_that_runs(
+    map_page, tmp_path: Path, monkeypatch
+) -> None:
+    map_page.execute_script(
+        "navigator.clipboard.writeText = async (text) => { window.copied = text; }"
+    )
     for button in ("copy-numbers", "copy-command"):
         map_page.find_element("id", button).click()
         wait_for(lambda button=button: map_page.find_element("id", button).text == "Copied")

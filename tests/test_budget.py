@@ -1,4 +1,6 @@
-"""The error budget: its parts follow from laws, and the laws bound what the study of sizes measured."""
+"""The error budget: its parts follow from laws, and the laws bound what the study of sizes
+measured.
+"""
 
 import json
 from pathlib import Path
@@ -6,7 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxgran.sampling.budget import BUDGET, SHARES, SIZE_LAWS, SizeLaw, error_budget, fewest_grains, size_error
+from jaxgran.sampling.budget import (
+    BUDGET,
+    SHARES,
+    SIZE_LAWS,
+    SizeLaw,
+    error_budget,
+    fewest_grains,
+    size_error,
+)
 from jaxgran.sampling.timestep import stress_error
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
@@ -22,7 +32,9 @@ MEASURED = {
 
 
 def budget_of(stderr=0.0, timestep=0.0, tolerance=0.0, grains=1e60):
-    return error_budget(MEASURED, dict.fromkeys(MEASURED, stderr), 0.5, 0.6, grains, timestep, tolerance)
+    return error_budget(
+        MEASURED, dict.fromkeys(MEASURED, stderr), 0.5, 0.6, grains, timestep, tolerance
+    )
 
 
 def test_every_part_alone_is_the_whole_error():
@@ -30,14 +42,20 @@ def test_every_part_alone_is_the_whole_error():
         if name not in BUDGET:
             continue
         assert budget_of(stderr=0.01)[name]["total"] == pytest.approx(0.0196, rel=1e-4)
-        step = 0.0 if name == "force_ratio" else float(stress_error(1e-3 * np.sqrt(0.4), 0.6)) * value
+        step = (
+            0.0 if name == "force_ratio" else float(stress_error(1e-3 * np.sqrt(0.4), 0.6)) * value
+        )
         assert budget_of(timestep=1e-3)[name]["total"] == pytest.approx(step, rel=1e-4, abs=1e-7)
-        assert budget_of(tolerance=1e-4)[name]["total"] == pytest.approx(34e-4 * 0.75 * value, rel=1e-3)
+        assert budget_of(tolerance=1e-4)[name]["total"] == pytest.approx(
+            34e-4 * 0.75 * value, rel=1e-3
+        )
 
 
 def test_parts_add_as_squares():
     parts = budget_of(0.01, 1e-3, 1e-4, 256)["pressure"]
-    squares = (1.96 * 0.01) ** 2 + parts["timestep"] ** 2 + parts["size"] ** 2 + parts["tolerance"] ** 2
+    squares = (
+        (1.96 * 0.01) ** 2 + parts["timestep"] ** 2 + parts["size"] ** 2 + parts["tolerance"] ** 2
+    )
     assert parts["total"] ** 2 == pytest.approx(squares)
 
 
@@ -57,7 +75,9 @@ def test_chosen_grains_are_the_fewest_of_their_series():
 
 @pytest.mark.parametrize("average", SIZE_LAWS)
 def test_law_of_the_size_is_the_fitted_one_and_its_bound_holds(average: str) -> None:
-    """Ratios of values at two N are those of the law within errors and spread, as often as 95 % intervals hold."""
+    """Ratios of values at two N are those of the law within errors and spread, as often as 95 %
+    intervals hold.
+    """
     found = json.loads((RESULTS / "size_limits.json").read_text())["laws"][average]["law"]
     assert tuple(SIZE_LAWS[average]) == pytest.approx(found["constants"], rel=2e-3, abs=1e-4)
     assert found["differences"] > 80

@@ -1,4 +1,6 @@
-"""Compiled programs are kept in the user's cache folder, in a temporary one, or nowhere: everything runs."""
+"""Compiled programs are kept in the user's cache folder, in a temporary one, or nowhere: everything
+runs.
+"""
 
 import os
 import subprocess
@@ -29,7 +31,9 @@ def test_the_users_folder_is_taken_if_it_can_be_written(tmp_path: Path, monkeypa
     assert not list(cache.users_folder().iterdir())
 
 
-def test_a_temporary_folder_that_nobody_else_can_write_takes_its_place(nothing_for_the_user: Path) -> None:
+def test_a_temporary_folder_that_nobody_else_can_write_takes_its_place(
+    nothing_for_the_user: Path,
+) -> None:
     assert cache.why_unwritable(cache.users_folder()) == "Not a directory"
     folder = cache.cache_folder()
     assert folder is not None and folder.parent == nothing_for_the_user
@@ -62,26 +66,32 @@ assert float(jg.solve_contacts(pair).impulses[0]) == 1
 assert jax.config.values == before, "a function of the package changes flags"
 print(folder())
 jg.use_cache()
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # whatever the speed of the machine
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # on any machine
 assert float(jax.jit(lambda x: 2 * x + 1)(1.0)) == 3
 print(folder())
 """
 
 
 def first_call(**variables: str) -> subprocess.CompletedProcess:
-    """A script that solves a contact problem, in a process of its own with these environment variables."""
+    """A script that solves a contact problem, in a process of its own with these environment
+    variables.
+    """
     set_here = ("TF_CPP_MIN_LOG_LEVEL", "XLA_FLAGS")
     environment = {x: y for x, y in os.environ.items() if x not in set_here} | variables
     command = [sys.executable, "-W", "error", "-c", FIRST_CALL]
     return subprocess.run(command, capture_output=True, text=True, env=environment)
 
 
-def test_a_script_keeps_programs_where_the_command_line_does_once_it_asks_for_it(tmp_path: Path) -> None:
+def test_a_script_keeps_programs_where_the_command_line_does_once_it_asks_for_it(
+    tmp_path: Path,
+) -> None:
     first, second = (first_call(XDG_CACHE_HOME=str(tmp_path)) for _ in range(2))
     imported, called = first.stdout.split()
     assert imported == "None" and Path(called).parent == tmp_path / "jaxgran"
     assert any(path.name.startswith("jit__lambda") for path in Path(called).iterdir())
-    assert second.stdout == first.stdout and first.stderr == second.stderr == ""  # XLA's log is silent, too
+    assert (
+        second.stdout == first.stdout and first.stderr == second.stderr == ""
+    )  # XLA's log is silent, too
 
 
 def test_what_the_user_sets_in_jax_stays(tmp_path: Path) -> None:

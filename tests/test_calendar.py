@@ -1,4 +1,6 @@
-"""The calendar of the numba engine: blocks with bounds find the events that a pass over all entries finds."""
+"""The calendar of the numba engine: blocks with bounds find the events that a pass over all entries
+finds.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ ENTRIES, CHANGES = 37 * LANES, 9
 
 @njit
 def events(shift, changed, entries, pairs, met, found):
-    """Visit the events of a calendar, each of which changes some entries; writes the step and the contacts of each."""
+    """Visit the events of a calendar, each of which changes some entries; writes the step and the
+    contacts of each.
+    """
     if shift > 0:
         calendar.bound_blocks(ENTRIES, shift, pairs)
     for event in range(found.shape[0]):
@@ -39,7 +43,9 @@ def made_up(draw: np.random.Generator, earliest: np.ndarray) -> np.ndarray:
     begins = earliest + draw.integers(1, 400, (*earliest.shape[:-1], ENTRIES))
     kind = draw.random(begins.shape)
     ends = np.where(kind < 0.5, -1, begins + draw.integers(0, 40, begins.shape))
-    strikes = np.where(kind < 0.75, NEVER, begins + draw.integers(0, 2, begins.shape) * (ends > begins))
+    strikes = np.where(
+        kind < 0.75, NEVER, begins + draw.integers(0, 2, begins.shape) * (ends > begins)
+    )
     return np.stack([strikes, np.where(kind < 0.5, NEVER, begins), ends], axis=-2).astype(np.int32)
 
 

@@ -36,7 +36,10 @@ def output(tmp_path: Path) -> Path:
 def batches() -> list[dict[Key, Replica]]:
     rng = np.random.default_rng(0)
     return [
-        {(point, seed): random_replica(rng, SETTINGS, Status.not_steady if point == 1 else 0) for seed in range(2)}
+        {
+            (point, seed): random_replica(rng, SETTINGS, Status.not_steady if point == 1 else 0)
+            for seed in range(2)
+        }
         for point in range(3)
     ]
 
@@ -73,14 +76,18 @@ def test_an_unfinished_map_is_never_overwritten(output: Path) -> None:
     Checkpoint(output, SETTINGS, resume=True).close(finished=False)
 
 
-@pytest.mark.parametrize("change", [{"solver": LOOSE}, {"restitution": (0.4, 0.9)}, {"engine": Jax()}])
+@pytest.mark.parametrize(
+    "change", [{"solver": LOOSE}, {"restitution": (0.4, 0.9)}, {"engine": Jax()}]
+)
 def test_another_map_is_refused_and_the_difference_named(output: Path, change: dict) -> None:
     cut_off(output)
     with refused(f"has {next(iter(change))} "):
         Checkpoint(output, replace(SETTINGS, **change), resume=True)
 
 
-def test_a_map_begun_on_the_processor_continues_there_beside_an_accelerator(output: Path, monkeypatch) -> None:
+def test_a_map_begun_on_the_processor_continues_there_beside_an_accelerator(
+    output: Path, monkeypatch
+) -> None:
     cut_off(output)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     with jax.default_device(jax.devices("cpu")[0]):
@@ -92,13 +99,17 @@ def test_files_of_another_format_are_refused_and_kept(output: Path, monkeypatch)
     folder = output.with_name("map.nc.unfinished")
     there = sorted(folder.iterdir())
     monkeypatch.setattr("jaxgran.io.atomic.FORMAT_VERSION", 3)
-    with pytest.raises(InputError, match="has format_version 2, and this version of jaxgran reads") as no:
+    with pytest.raises(
+        InputError, match="has format_version 2, and this version of jaxgran reads"
+    ) as no:
         Checkpoint(output, SETTINGS, resume=True)
     assert one_sentence(str(no.value)) and sorted(folder.iterdir()) == there
 
 
 @pytest.mark.parametrize("how", ["torn", "flipped", "empty"])
-def test_a_damaged_file_is_one_sentence_and_a_damaged_journal_is_removed(output: Path, how: str) -> None:
+def test_a_damaged_file_is_one_sentence_and_a_damaged_journal_is_removed(
+    output: Path, how: str
+) -> None:
     cut_off(output)
     folder = output.with_name("map.nc.unfinished")
     journal = journal_of(output, (3, 0))
@@ -107,10 +118,16 @@ def test_a_damaged_file_is_one_sentence_and_a_damaged_journal_is_removed(output:
         whole = bytearray(file.read_bytes())
         middle = len(whole) // 2
         whole[middle : middle + 64] = bytes(255 - x for x in whole[middle : middle + 64])
-        file.write_bytes({"torn": bytes(whole[:middle]), "flipped": bytes(whole), "empty": b""}[how])
+        file.write_bytes(
+            {"torn": bytes(whole[:middle]), "flipped": bytes(whole), "empty": b""}[how]
+        )
         if file == journal:
             resumed = Checkpoint(output, SETTINGS, resume=True)
-            assert resumed.journals() == [] and resumed.damaged == [journal.name] and not journal.exists()
+            assert (
+                resumed.journals() == []
+                and resumed.damaged == [journal.name]
+                and not journal.exists()
+            )
             resumed.close(finished=False)
     with pytest.raises(InputError, match="damaged: remove the folder") as refused:
         Checkpoint(output, SETTINGS, resume=True)
@@ -181,10 +198,15 @@ def test_the_lock_is_taken_again_with_a_folder_that_was_removed(output: Path) ->
     assert list(output.parent.iterdir()) == []
 
 
-def test_what_was_being_written_or_removed_when_a_process_was_killed_is_tidied_up(output: Path) -> None:
+def test_what_was_being_written_or_removed_when_a_process_was_killed_is_tidied_up(
+    output: Path,
+) -> None:
     cut_off(output)
     folder = output.with_name("map.nc.unfinished")
-    for litter in (folder / ".map-0123456789abcdef.nc", output.with_name(".map-0123456789abcdef.nc")):
+    for litter in (
+        folder / ".map-0123456789abcdef.nc",
+        output.with_name(".map-0123456789abcdef.nc"),
+    ):
         litter.write_bytes(b"half")
     shutil.copytree(folder, output.with_name(".map.nc.unfinished"))
     other = output.with_name(".map-of-mine.nc")

@@ -54,11 +54,30 @@ SMALL_MAP = (
     "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 32 --seeds 1 --timestep 1e-3 "
     "--equilibrate 0.5 --strain 2 --workers 1 --output small.nc"
 )
-SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "activation", "precision")
+SAME = (
+    "grains",
+    "seeds",
+    "timestep",
+    "strain",
+    "equilibrate",
+    "tolerance",
+    "activation",
+    "precision",
+)
 SAME += ("solver", "engine", "solver_requested", "engine_requested")
 PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "factors", "clusters")}
 FRAMES = ["--trajectory", "flow.gsd", "--frame-strain", "0.1"]
-SMALL_RUN = ["run", "--restitution", "0.7", "--packing-fraction", "0.6", "--grains", "32", "--timestep", "auto"]
+SMALL_RUN = [
+    "run",
+    "--restitution",
+    "0.7",
+    "--packing-fraction",
+    "0.6",
+    "--grains",
+    "32",
+    "--timestep",
+    "auto",
+]
 SMALL_RUN += ["--strain", "1", "--output", "flow.nc"]
 
 
@@ -95,11 +114,14 @@ MISTAKES = {  # one for each kind of option, check and file
     "map --scheduler tcp://127.0.0.1:9 --workers 2": "--scheduler and --workers exclude each other",
     "map --from-map text.nc": "not a NetCDF file",
     f"{FLOW} --frame-strain 1": "--frame-strain requires --trajectory or --movie",
-    f"{FLOW} --trajectory flow.gsd --force-strain 1": "--force-strain must be above 0 and at most the strain between",
-    f"{FLOW} --movie flow.gif --seeds 2": "--trajectory and --movie show one seed: leave out --seeds",
+    f"{FLOW} --trajectory flow.gsd --force-strain 1": "--force-strain must be above 0 and at most "
+    "the strain between",
+    f"{FLOW} --movie flow.gif --seeds 2": "--trajectory and --movie show one seed: leave out "
+    "--seeds",
     f"{FLOW} --resume": "--resume requires --output",
     "run --restitution 0.5": "--packing-fraction must be given: see jaxgran run --help",
-    "where --restitution 0.7 --packing-fraction 0.9": "--packing-fraction must be between 0.1 and 0.83",
+    "where --restitution 0.7 --packing-fraction 0.9": "--packing-fraction must be between 0.1 and "
+    "0.83",
     "draw": "there is no command 'draw': see jaxgran --help",
     "run --alpha 0.5": "there is no option --alpha, perhaps --restitution is meant",
     "map --outptu map.nc": "there is no option --outptu, perhaps --output is meant",
@@ -117,7 +139,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("command", "accepted"), MISTAKES.items(), ids=MISTAKES)
-def test_a_mistake_is_one_sentence_and_leaves_nothing_behind(command: str, accepted: str, folder: Path) -> None:
+def test_a_mistake_is_one_sentence_and_leaves_nothing_behind(
+    command: str, accepted: str, folder: Path
+) -> None:
     before = files(folder)
     outcome = jaxgran(folder, *("" if word == "''" else word for word in command.split()))
     assert_one_sentence(outcome)
@@ -156,7 +180,10 @@ def small_data(small_map) -> xr.DataTree:
 def test_map_prints_the_tables_and_the_progress_apart(small_map, small_data) -> None:
     (_, (_, out, err)), data = small_map, small_data
     for ratio, error in ((data.force_ratio, data.force_ratio_stderr), shear_stress_ratio(data)):
-        cells = (with_error(float(x), float(dx)) for x, dx in zip(ratio.values.flat, error.values.flat, strict=True))
+        cells = (
+            with_error(float(x), float(dx))
+            for x, dx in zip(ratio.values.flat, error.values.flat, strict=True)
+        )
         assert all(cell in out for cell in cells)
     assert "points" not in out and "4/4 points" in err and "wrote small.nc" in err
 
@@ -169,20 +196,38 @@ def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(
     write_few_variables(monkeypatch, "pressure")
     data.attrs["version_jax"] = "0.1.0"
     write_dataset(data, other)
-    outcome = jaxgran(tmp_path, "map", "--from-map", "other.nc", "--workers", "1", "--output", "again.nc")
+    outcome = jaxgran(
+        tmp_path, "map", "--from-map", "other.nc", "--workers", "1", "--output", "again.nc"
+    )
     again = open_map(tmp_path / "again.nc")
     assert again.force_ratio.equals(data.force_ratio) and again.pressure.equals(data.pressure)
-    assert f"version jax 0.1.0 there, {again.attrs['version_jax']} here" in outcome.err.splitlines()[0]
-    assert {k: v for k, v in again.attrs.items() if k in SAME} == {k: v for k, v in data.attrs.items() if k in SAME}
+    assert (
+        f"version jax 0.1.0 there, {again.attrs['version_jax']} here" in outcome.err.splitlines()[0]
+    )
+    assert {k: v for k, v in again.attrs.items() if k in SAME} == {
+        k: v for k, v in data.attrs.items() if k in SAME
+    }
 
 
-def test_plot_makes_its_folder_and_writes_other_formats_without_caption(small_map, tmp_path: Path, monkeypatch) -> None:
+def test_plot_makes_its_folder_and_writes_other_formats_without_caption(
+    small_map, tmp_path: Path, monkeypatch
+) -> None:
     folder, _ = small_map
     for name in FIGURES:
         monkeypatch.setitem(FIGURES, name, FIGURES[name]._replace(draw=lambda _: Figure()))
-    words = ("plot", "small.nc", "--output", str(tmp_path / "new" / "figures"), "--format", "svg", "--no-caption")
+    words = (
+        "plot",
+        "small.nc",
+        "--output",
+        str(tmp_path / "new" / "figures"),
+        "--format",
+        "svg",
+        "--no-caption",
+    )
     assert jaxgran(folder, *words).status == 0
-    assert files(tmp_path / "new" / "figures") == {name.replace(".png", ".svg") for name in PICTURES}
+    assert files(tmp_path / "new" / "figures") == {
+        name.replace(".png", ".svg") for name in PICTURES
+    }
     assert files(folder) >= PICTURES
 
 
@@ -213,13 +258,19 @@ def parsed(text: str) -> dict[str, Any]:
 def test_run_prints_rows_of_physics_or_json_of_every_average(small_run) -> None:
     folder, _ = small_run
     short, as_json = (jaxgran(folder, *SMALL_RUN, "--resume", *more) for more in ((), ("--json",)))
-    assert "shear-stress ratio" in short.out and short.out.count("±") == 1 + 10  # the heading, and a row for each
+    assert (
+        "shear-stress ratio" in short.out and short.out.count("±") == 1 + 10
+    )  # the heading, and a row for each
     found, data = parsed(as_json.out), flattened(open_map(folder / "flow.nc")).squeeze()
     assert as_json.status == short.status and set(OBSERVABLES) < set(found)
     for name, one in OBSERVABLES.items():
-        np.testing.assert_array_equal(np.array(found[name]["value"], float), data[path_of(name)])  # null is NaN
+        np.testing.assert_array_equal(
+            np.array(found[name]["value"], float), data[path_of(name)]
+        )  # null is NaN
         if one.group != "diagnostics":
-            np.testing.assert_array_equal(np.array(found[name]["stderr"], float), data[f"{path_of(name)}_stderr"])
+            np.testing.assert_array_equal(
+                np.array(found[name]["stderr"], float), data[f"{path_of(name)}_stderr"]
+            )
         assert found[name]["unit"] == one.unit
     assert found["status"]["value"] in Status.__members__ and found["grains"]["value"] == 32
 
@@ -230,8 +281,15 @@ def test_a_reader_that_has_gone_changes_no_exit_status(words: str, tmp_path: Pat
     """As in ``jaxgran info | head -2``: the command does its work, and ends as it would."""
     ends = []
     for closed in (False, True):
-        command = [sys.executable, "-c", "from jaxgran.cli.app import program; program()", *words.split()]
-        with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
+        command = [
+            sys.executable,
+            "-c",
+            "from jaxgran.cli.app import program; program()",
+            *words.split(),
+        ]
+        with subprocess.Popen(
+            command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        ) as process:
             process.stdout.close() if closed else process.stdout.read()
             ends.append(process.wait())
     assert ends == [2 if "run" in words else 0] * 2
@@ -251,8 +309,19 @@ def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:
 def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
     outcome = in_a_process(tmp_path, "info")
     assert (outcome.status, outcome.err) == (0, "")
-    lines = dict(re.split(r"\s{2,}", line, maxsplit=1) for line in outcome.out.splitlines() if "  " in line)
-    assert {"python", "jax", "jaxlib", "devices", "platform", "processor", "cores", "memory"} <= set(lines)
+    lines = dict(
+        re.split(r"\s{2,}", line, maxsplit=1) for line in outcome.out.splitlines() if "  " in line
+    )
+    assert {
+        "python",
+        "jax",
+        "jaxlib",
+        "devices",
+        "platform",
+        "processor",
+        "cores",
+        "memory",
+    } <= set(lines)
     assert lines["precision"] == "float64" and lines["engine"] == "auto takes numba"
     assert lines["jaxgran"].startswith(version("jaxgran")) and str(usable_cores()) in lines["cores"]
     for name in ("cache folder", "compiled programs", "numba engine", "figures"):
@@ -286,12 +355,22 @@ def test_help_teaches_by_examples_that_are_accepted(command: str, tmp_path: Path
     for example in HELPS[command].values():
         assert example.replace(" ", "") in outcome.out.replace(" ", "")
         first, name, *words = shlex.split(example)
-        assert first == "jaxgran" and ("--help" in words or group.commands[name].make_context(name, list(words)))
+        assert first == "jaxgran" and (
+            "--help" in words or group.commands[name].make_context(name, list(words))
+        )
 
 
 def test_given_options_replace_what_a_file_chose_for_its_error() -> None:
-    """Grains by point hold for the points of the file only, and either a strain or an error holds."""
-    chosen = {"restitution": (0.5,), "grains": 512, "grains_by_point": (512,), "error": 0.1, "seeds": 1}
+    """Grains by point hold for the points of the file only, and either a strain or an error
+    holds.
+    """
+    chosen = {
+        "restitution": (0.5,),
+        "grains": 512,
+        "grains_by_point": (512,),
+        "error": 0.1,
+        "seeds": 1,
+    }
     assert combined(chosen, {}) == chosen
     assert combined(chosen, {"restitution": (0.2, 0.5)}) == {
         **{name: value for name, value in chosen.items() if name != "grains_by_point"},
@@ -314,7 +393,8 @@ def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeyp
     def notes(settings, *_) -> Iterator:
         asked.append(settings)
         yield from (
-            ((0, seed), random_replica(np.random.default_rng(seed), settings)) for seed in range(settings.seeds)
+            ((0, seed), random_replica(np.random.default_rng(seed), settings))
+            for seed in range(settings.seeds)
         )
 
     monkeypatch.setattr(ratio_map_module, "run_replicas", notes)
@@ -322,7 +402,12 @@ def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeyp
     words = "--seeds 2 --first-seed 7 --tolerance 1e-6 --solver jacobi --activation touching"
     assert jaxgran(tmp_path, *flow, *words.split()).status == 0
     (one,) = asked
-    assert (one.seeds, one.first_seed, one.solver, one.activation) == (2, 7, Jacobi(tolerance=1e-6), "touching")
+    assert (one.seeds, one.first_seed, one.solver, one.activation) == (
+        2,
+        7,
+        Jacobi(tolerance=1e-6),
+        "touching",
+    )
 
 
 def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, monkeypatch) -> None:
@@ -335,14 +420,19 @@ def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, mo
     assert outcome.status == 3
     for k, status in points.items():
         alpha = 0.9 * k / (len(points) - 1)
-        named = f"{status.name.replace('_', ' ')} at (restitution {alpha:g}, packing fraction 0.6)" in outcome.err
+        named = (
+            f"{status.name.replace('_', ' ')} at (restitution {alpha:g}, packing fraction 0.6)"
+            in outcome.err
+        )
         assert named == (status != Status.ok), status
     assert outcome.out.count("*") >= 2 * (len(points) - 1)  # force ratio and shear-stress ratio
 
 
 def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypatch) -> None:
     write_few_variables(monkeypatch)
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(1, 0): Status.ok}, KeyboardInterrupt))
+    monkeypatch.setattr(
+        ratio_map_module, "run_replicas", made_up_replicas({(1, 0): Status.ok}, KeyboardInterrupt)
+    )
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "half.nc")
     assert outcome.status == 130
     assert files(tmp_path) == {"half.nc", "half.nc.unfinished"}
@@ -354,11 +444,16 @@ def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypa
     assert outcome.err.rstrip().endswith(f"Continue: {command} --resume")
 
 
-def test_a_flow_interrupted_before_it_has_a_value_prints_one_sentence(tmp_path: Path, monkeypatch) -> None:
+def test_a_flow_interrupted_before_it_has_a_value_prints_one_sentence(
+    tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({}, KeyboardInterrupt))
     flow = (*FLOW.split(), "--quiet", "--output", "flow.nc")
     outcome, as_json = jaxgran(tmp_path, *flow), jaxgran(tmp_path, *flow, "--json")
-    assert (outcome.status, outcome.out) == (130, "") and (as_json.status, as_json.err) == (130, outcome.err)
+    assert (outcome.status, outcome.out) == (130, "") and (as_json.status, as_json.err) == (
+        130,
+        outcome.err,
+    )
     assert outcome.err == "jaxgran: interrupted; nothing is saved.\n"
     assert parsed(as_json.out)["force_ratio"]["value"] is None
     assert not files(tmp_path)
@@ -371,7 +466,9 @@ def test_an_interruption_inside_compiled_code_is_one(tmp_path: Path, monkeypatch
     class Inside(SystemError):
         __cause__ = KeyboardInterrupt()
 
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(1, 0): Status.ok}, Inside))
+    monkeypatch.setattr(
+        ratio_map_module, "run_replicas", made_up_replicas({(1, 0): Status.ok}, Inside)
+    )
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "half.nc")
     assert outcome.status == 130 and outcome.err.rstrip().endswith("--output half.nc --resume")
     monkeypatch.setattr("jaxgran.maps.results.open_map", Mock(side_effect=Inside))

@@ -13,18 +13,25 @@ from jaxgran.maps.cluster import Provenance, run_on_cluster
 from jaxgran.maps.provenance import made_with
 from jaxgran.maps.results import open_map
 
-MAP = "--restitution 0.5,0.9 --packing-fraction 0.6 --grains 16 --seeds 1 --timestep 1e-3 --equilibrate 0 --strain 0.32"
+MAP = (
+    "--restitution 0.5,0.9 --packing-fraction 0.6 --grains 16 --seeds 1 --timestep 1e-3 "
+    "--equilibrate 0 --strain 0.32"
+)
 SCRIPT = Path(__file__).parents[1] / "docs" / "how-to" / "slurm_map.py"
 
 
 def run(folder: Path, *words: str) -> subprocess.CompletedProcess:
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir}
-    return subprocess.run([sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True)
+    return subprocess.run(
+        [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True
+    )
 
 
 @pytest.mark.environment
 def test_a_map_on_a_cluster_is_that_of_one_process(tmp_path: Path) -> None:
-    here = run(tmp_path, "-m", "jaxgran", "map", *MAP.split(), "--workers", "1", "--output", "here.nc")
+    here = run(
+        tmp_path, "-m", "jaxgran", "map", *MAP.split(), "--workers", "1", "--output", "here.nc"
+    )
     there = run(tmp_path, str(SCRIPT), "--workers", "2", "--", *MAP.split(), "--output", "there.nc")
     assert here.returncode == there.returncode, there.stderr
     assert open_map(tmp_path / "there.nc").equals(open_map(tmp_path / "here.nc"))
@@ -71,7 +78,9 @@ def test_provenance_is_that_of_the_workers(monkeypatch) -> None:
     worker = made_with() | {"device": "gpu: one", "platform": "Linux, 1 cores"}
     outcome, made = outcome_of(worker, monkeypatch)
     assert outcome == [(0, "result")]
-    assert {name: list(values) for name, values in made.items()} == {name: [value] for name, value in worker.items()}
+    assert {name: list(values) for name, values in made.items()} == {
+        name: [value] for name, value in worker.items()
+    }
 
 
 @pytest.mark.parametrize("name", ["code_digest", "version_jax"])

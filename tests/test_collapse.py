@@ -1,4 +1,6 @@
-"""Inelastic collapse of three and four discs in a row: exact laws of the time step below and above the thresholds."""
+"""Inelastic collapse of three and four discs in a row: exact laws of the time step below and above
+the thresholds.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -27,11 +29,19 @@ def test_roots_of_a_collapse_are_real_below_the_threshold(discs, angle) -> None:
     assert 0 < smaller < larger < 1
 
 
-@pytest.mark.parametrize(("discs", "restitution"), [(3, 0.08), (3, 0.1), (3, 0.3), (4, 0.18), (4, 0.2), (4, 0.5)])
-def test_above_the_threshold_the_steps_of_contact_saturate_and_are_binary(steps_and_excess, discs, restitution) -> None:
-    """No start has more collisions than the rotation by θ allows, and one of these has all but two."""
+@pytest.mark.parametrize(
+    ("discs", "restitution"), [(3, 0.08), (3, 0.1), (3, 0.3), (4, 0.18), (4, 0.2), (4, 0.5)]
+)
+def test_above_the_threshold_the_steps_of_contact_saturate_and_are_binary(
+    steps_and_excess, discs, restitution
+) -> None:
+    """No start has more collisions than the rotation by θ allows, and one of these has all but
+    two.
+    """
     states = [row(discs, gap) for gap in GAPS[::4]]
-    steps, excess = np.stack([steps_and_excess(restitution, dt, states) for dt in (1e-6, 1e-7)], axis=1)
+    steps, excess = np.stack(
+        [steps_and_excess(restitution, dt, states) for dt in (1e-6, 1e-7)], axis=1
+    )
     np.testing.assert_array_equal(steps[0], steps[1])
     most = most_collisions(discs, restitution)
     assert most - 2 <= np.max(steps) <= most
@@ -39,7 +49,9 @@ def test_above_the_threshold_the_steps_of_contact_saturate_and_are_binary(steps_
 
 
 @pytest.mark.parametrize(("discs", "restitution"), [(3, 0.02), (3, 0.04), (4, 0.05), (4, 0.1)])
-def test_below_the_threshold_steps_grow_and_the_excess_falls_by_the_roots(engines, discs, restitution) -> None:
+def test_below_the_threshold_steps_grow_and_the_excess_falls_by_the_roots(
+    engines, discs, restitution
+) -> None:
     exact = roots(discs, restitution)
     found = slopes(exact, restitution, [row(discs, gap) for gap in GAPS], engines["numba"])
     for values, expected in zip(found, (exact.steps_per_decade, exact.exponent), strict=True):
@@ -56,6 +68,8 @@ def test_three_discs_collapse_where_the_third_leaves_more_slowly_than_the_larger
     leaving = share * roots(3, restitution).larger
     velocities = speed * np.array([1.0, 0.0, leaving])
     states = [row(3, gap) for gap in GAPS[::4]]
-    states = [replace(state, velocities=state.velocities.at[:3, 0].set(velocities)) for state in states]
+    states = [
+        replace(state, velocities=state.velocities.at[:3, 0].set(velocities)) for state in states
+    ]
     coarse, fine = (steps_and_excess(restitution, dt, states)[0] for dt in (1e-6, 1e-8))
     assert fine.mean() > coarse.mean() + 1 if collapses else np.array_equal(fine, coarse)

@@ -1,4 +1,6 @@
-"""The collection of contact problems: certificates against exact fractions, the file, and solvers side by side."""
+"""The collection of contact problems: certificates against exact fractions, the file, and solvers
+side by side.
+"""
 
 import hashlib
 import json
@@ -10,7 +12,14 @@ import pytest
 
 from benchmarks import networks
 from benchmarks.collection import PATH, Entry, load
-from benchmarks.collection.certificates import Problem, certificate, delassus, obstacle, obstructed, solved
+from benchmarks.collection.certificates import (
+    Problem,
+    certificate,
+    delassus,
+    obstacle,
+    obstructed,
+    solved,
+)
 from benchmarks.collection.problems import compact
 from benchmarks.exact_contacts import certified_impulses
 from benchmarks.exact_contacts import incidence as dense_incidence
@@ -33,9 +42,13 @@ def problem_of(network: Network) -> Problem:
 
 
 def rough(network: Network) -> np.ndarray:
-    """The solution in double precision by a method of the other reference, with an error of a millionth."""
+    """The solution in double precision by a method of the other reference, with an error of a
+    millionth.
+    """
     used = np.asarray(network.contacts.used)
-    g = dense_incidence(network.contacts, network.grains)[used] / np.repeat(np.sqrt(network.masses), 2)
+    g = dense_incidence(network.contacts, network.grains)[used] / np.repeat(
+        np.sqrt(network.masses), 2
+    )
     impulses = certified_impulses(g, np.asarray(network.contacts.approach)[used])
     assert impulses is not None
     return impulses * (1 + 1e-6 * np.sin(np.arange(len(impulses))))
@@ -75,11 +88,15 @@ def test_solution_is_one_in_exact_fractions(network):
     high, low = solution.impulses, solution.impulses_low
     after, own = after_in_fractions(problem, high, low), delassus(problem).diagonal()
     speed = np.linalg.norm(np.minimum(problem.approach, 0))
-    push = [Fraction(o) * (Fraction(a) + Fraction(b)) for o, a, b in zip(own, high, low, strict=True)]
+    push = [
+        Fraction(o) * (Fraction(a) + Fraction(b)) for o, a, b in zip(own, high, low, strict=True)
+    ]
     least = [float(min(x, y)) for x, y in zip(push, after, strict=True)]
     assert min(push) >= 0
     assert np.linalg.norm(least) <= 1e-28 * speed
-    np.testing.assert_allclose(solution.certificate["natural_map"], np.linalg.norm(least) / speed, rtol=1e-6)
+    np.testing.assert_allclose(
+        solution.certificate["natural_map"], np.linalg.norm(least) / speed, rtol=1e-6
+    )
     np.testing.assert_allclose(solution.velocities, [float(x) for x in after], rtol=1e-15)
 
 
@@ -89,7 +106,9 @@ def test_weights_prove_in_exact_fractions_that_there_is_no_solution(network):
     problem = problem_of(network)
     proof = obstructed(problem)
     assert proof is not None and not proof.feasible
-    weights = [Fraction(a) + Fraction(b) for a, b in zip(proof.impulses, proof.impulses_low, strict=True)]
+    weights = [
+        Fraction(a) + Fraction(b) for a, b in zip(proof.impulses, proof.impulses_low, strict=True)
+    ]
     total = np.full((len(problem.masses), 2), Fraction(0))
     for (i, j), normal, weight in zip(problem.ends, problem.normals, weights, strict=True):
         total[i] += [Fraction(n) * weight for n in normal]
@@ -108,7 +127,9 @@ def test_committed_collection_is_the_one_of_its_summary_and_its_solutions_hold()
     assert sum(not one.solution.feasible for one in entries) >= 7
     for one in entries:
         matrix, impulses, approach = one.matrix, one.solution.impulses, one.problem.approach
-        if one.solution.feasible:  # in double precision: for all; by the certificate: for every tenth
+        if (
+            one.solution.feasible
+        ):  # in double precision: for all; by the certificate: for every tenth
             after, own = matrix @ impulses + approach, matrix.diagonal()
             speed = np.linalg.norm(np.minimum(approach, 0))
             assert np.linalg.norm(np.minimum(own * impulses, after)) <= 1e-9 * speed
@@ -117,6 +138,8 @@ def test_committed_collection_is_the_one_of_its_summary_and_its_solutions_hold()
     for one in entries[::10]:
         high, low = one.solution[1:3]
         if one.solution.feasible:
-            assert certificate(one.problem, high, low) == pytest.approx(one.solution.certificate, rel=1e-6, abs=1e-40)
+            assert certificate(one.problem, high, low) == pytest.approx(
+                one.solution.certificate, rel=1e-6, abs=1e-40
+            )
         else:
             assert obstacle(one.problem, high, low) < 1e-28

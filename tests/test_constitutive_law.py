@@ -1,4 +1,6 @@
-"""The constitutive law of the reference map: scaling, balance of energy, derivatives, range, file and example."""
+"""The constitutive law of the reference map: scaling, balance of energy, derivatives, range, file
+and example.
+"""
 
 import re
 from pathlib import Path
@@ -22,7 +24,9 @@ PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "constitutive-law.md"
 
 def a_plane(rows: int = 15) -> tuple[np.ndarray, np.ndarray]:
     """Restitutions and packing fractions over the whole range."""
-    return np.linspace(*LAW.restitution_range, rows)[:, None], np.linspace(*LAW.packing_fraction_range, rows)
+    return np.linspace(*LAW.restitution_range, rows)[:, None], np.linspace(
+        *LAW.packing_fraction_range, rows
+    )
 
 
 @settings(max_examples=20, deadline=None)
@@ -46,7 +50,9 @@ def test_power_of_the_shear_is_dissipated_within_the_errors() -> None:
 
 def test_long_waves_raise_the_granular_temperature() -> None:
     flow = LAW(*a_plane())
-    assert np.all(flow.local_granular_temperature < flow.granular_temperature + flow.granular_temperature_ci95)
+    assert np.all(
+        flow.local_granular_temperature < flow.granular_temperature + flow.granular_temperature_ci95
+    )
 
 
 def test_correlations_vanish_towards_elastic_grains_and_grow_with_dissipation() -> None:
@@ -58,7 +64,9 @@ def test_correlations_vanish_towards_elastic_grains_and_grow_with_dissipation() 
 
 
 def test_length_follows_from_correlated_velocities_where_collisions_are_binary() -> None:
-    """Grains that approach more slowly by a factor f have f² of the contact pressure and f³ of the loss: L′ = 1/f."""
+    """Grains that approach more slowly by a factor f have f² of the contact pressure and f³ of the
+    loss: L′ = 1/f.
+    """
     alphas, nus = (x.ravel() for x in np.broadcast_arrays(*a_plane()))
     found = jg.validity(alphas, nus)
     binary = found.measured["force_ratio"] < 1.01
@@ -68,14 +76,17 @@ def test_length_follows_from_correlated_velocities_where_collisions_are_binary()
     assert np.all((product > 0.97) & (product < 1.05))
 
 
-@pytest.mark.parametrize("name", ["pressure", "shear_stress", "dissipation_rate", "pressure_ci95", LENGTH])
+@pytest.mark.parametrize(
+    "name", ["pressure", "shear_stress", "dissipation_rate", "pressure_ci95", LENGTH]
+)
 def test_gradients_are_those_of_finite_differences(name: str) -> None:
     def of(x: Any) -> Any:
         return getattr(LAW(x[0], x[1], x[2]), name)
 
     at, step = jnp.array([0.45, 0.71, 1.3]), 1e-4
     by_steps = [(of(at + step * one) - of(at - step * one)) / (2 * step) for one in np.eye(3)]
-    # an interval is the root of a difference of numbers of order 500, whose rounding a difference over steps magnifies
+    # an interval is the root of a difference of numbers of order 500, whose rounding a difference
+    # over steps magnifies
     rtol = 1e-4 if name.endswith("ci95") else 1e-5
     np.testing.assert_allclose(jax.grad(of)(at), by_steps, rtol=rtol, atol=1e-8)
 
@@ -87,7 +98,9 @@ def test_arrays_broadcast_with_the_shear_rate() -> None:
     same, same_half_widths = np.split(np.stack(compiled), 2)
     assert averages.shape[1:] == (2, 3)
     np.testing.assert_allclose(averages, same, rtol=1e-7)
-    np.testing.assert_allclose(half_widths / averages, same_half_widths / averages, atol=1e-6)  # small differences
+    np.testing.assert_allclose(
+        half_widths / averages, same_half_widths / averages, atol=1e-6
+    )  # small differences
     assert flow.pressure[1, 2] == pytest.approx(LAW(0.6, 0.7, 3.0).pressure)
 
 
@@ -111,23 +124,38 @@ def test_the_file_is_the_law_at_its_points_and_says_what_it_is(tmp_path: Path) -
     flows = columns["restitution"], columns["packing_fraction"]
     for name, values in LAW(*flows)._asdict().items():
         np.testing.assert_allclose(columns[name], values, rtol=1e-5)
-    for x, (low, high) in zip(flows, (LAW.restitution_range, LAW.packing_fraction_range), strict=True):
+    for x, (low, high) in zip(
+        flows, (LAW.restitution_range, LAW.packing_fraction_range), strict=True
+    ):
         assert x.min() == low and x.max() == high
     assert head["version"] == jg.__version__
-    assert {"map", "grains", "timestep", "ci95", "units", *(f"unit of {x}" for x in (*MEASURED, LENGTH))} <= {*head}
+    assert {
+        "map",
+        "grains",
+        "timestep",
+        "ci95",
+        "units",
+        *(f"unit of {x}" for x in (*MEASURED, LENGTH)),
+    } <= {*head}
     LAW.to_csv(tmp_path / "law.csv", [0.5, 0.6], [0.7])
     assert read_columns(tmp_path / "law.csv")[1]["restitution"].tolist() == [0.5, 0.6]
     text = (tmp_path / "law.csv").read_text(encoding="utf-8")
-    (tmp_path / "law.csv").write_text(text.replace("format_version: 1", "format_version: 7"), encoding="utf-8")
+    (tmp_path / "law.csv").write_text(
+        text.replace("format_version: 1", "format_version: 7"), encoding="utf-8"
+    )
     with pytest.raises(jg.InputError, match="reads format_version 1"):
         read_columns(tmp_path / "law.csv")
 
 
-def test_the_layer_of_the_page_is_in_mechanical_balance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_layer_of_the_page_is_in_mechanical_balance(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        for block in re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
+        for block in re.findall(
+            r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+        ):
             exec(block, names)
         stress, gravity, pressures = 0.3, 0.05, jnp.linspace(1.0, 1.2, 200)
         depth, velocity, nu, temperature = names["layer"](0.6, pressures, stress, gravity)

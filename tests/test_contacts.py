@@ -1,4 +1,6 @@
-"""The rule that makes a pair a contact, and the time of first contact, against flights followed in small steps."""
+"""The rule that makes a pair a contact, and the time of first contact, against flights followed in
+small steps.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +17,15 @@ PAIRS, INSTANTS = 256, 1001
 seeds = given(st.integers(0, 2**32 - 1))
 modest = settings(max_examples=20)
 
-compiled_rule, compiled_time, compiled_network = map(jax.jit, (is_contact, first_contact_time, contact_network))
+compiled_rule, compiled_time, compiled_network = map(
+    jax.jit, (is_contact, first_contact_time, contact_network)
+)
 
 
 def flights(seed: int, speed: float = 10.0):
-    """Pairs around contact, overlapping or not, with any velocity: separations, relative velocities, reaches."""
+    """Pairs around contact, overlapping or not, with any velocity: separations, relative
+    velocities, reaches.
+    """
     rng = np.random.default_rng(seed)
     angles, reach = rng.uniform(0, 2 * np.pi, PAIRS), rng.uniform(0.74, 1.26, PAIRS)
     distance = reach + rng.normal(size=PAIRS) * 10 ** rng.uniform(-6, -1, PAIRS)
@@ -43,13 +49,17 @@ def excess(separations, velocities, reach, times):
 def test_contact_is_a_pair_that_the_flight_makes_overlap(seed, look_ahead):
     separations, velocities, reach = flights(seed)
     contact, approaching = (
-        np.asarray(found) for found in compiled_rule(motion(separations, velocities), reach, look_ahead)
+        np.asarray(found)
+        for found in compiled_rule(motion(separations, velocities), reach, look_ahead)
     )
     times = np.linspace(0, look_ahead, INSTANTS)
     along = excess(separations, velocities, reach, times[:, None] * np.ones(PAIRS))
-    towards = np.sum(separations * velocities, axis=1) < 0  # even if the closest approach is before the next instant
+    towards = (
+        np.sum(separations * velocities, axis=1) < 0
+    )  # even if the closest approach is before the next instant
     deepest = np.where(towards, np.min(along, axis=0), along[-1])
-    # between two instants the squared distance falls below both by at most (half their distance in space)²
+    # between two instants the squared distance falls below both by at most (half their distance in
+    # space)²
     undecided = np.sum(velocities**2, axis=1) * (look_ahead / (INSTANTS - 1) / 2) ** 2 + 8 * EPS
     decided = np.abs(deepest) > undecided
     assert np.mean(decided) > 0.9
@@ -61,7 +71,9 @@ def test_contact_is_a_pair_that_the_flight_makes_overlap(seed, look_ahead):
 @seeds
 def test_time_of_first_contact_is_exact(seed):
     separations, velocities, reach = flights(seed)
-    time, closest = (np.asarray(found) for found in compiled_time(motion(separations, velocities), reach))
+    time, closest = (
+        np.asarray(found) for found in compiled_time(motion(separations, velocities), reach)
+    )
     closing = np.sum(separations * velocities, axis=1)
     assert np.all((closest > 0) == (closing < 0))
     slope = closing + closest * np.sum(velocities**2, axis=1)
@@ -83,13 +95,17 @@ def test_time_of_first_contact_is_exact(seed):
 @modest
 @seeds
 def test_rule_and_time_of_first_contact_agree(seed):
-    """An approaching pair is a contact just when its first contact comes within the look-ahead time."""
+    """An approaching pair is a contact just when its first contact comes within the look-ahead
+    time.
+    """
     separations, velocities, reach = flights(seed)
     time, _ = (np.asarray(found) for found in compiled_time(motion(separations, velocities), reach))
     for look_ahead in (1e-3, 1e-2):
         _, approaching = compiled_rule(motion(separations, velocities), reach, look_ahead)
         decided = ~np.isfinite(time) | (np.abs(time - look_ahead) > 64 * EPS)
-        np.testing.assert_array_equal(np.asarray(approaching)[decided], (time <= look_ahead)[decided])
+        np.testing.assert_array_equal(
+            np.asarray(approaching)[decided], (time <= look_ahead)[decided]
+        )
 
 
 @pytest.mark.parametrize("slots", [4, 16])
@@ -101,7 +117,9 @@ def test_network_holds_its_contacts_and_its_empty_slots_are_inert(slots):
     picked = np.array([200, 3, 77])
     index = np.concatenate([picked, np.zeros(slots - 3, int)])
     pairs = motion(separations[index], velocities[index])
-    network = jax.tree.map(np.asarray, compiled_network(np.arange(slots) < 3, i[index], j[index], pairs, grains))
+    network = jax.tree.map(
+        np.asarray, compiled_network(np.arange(slots) < 3, i[index], j[index], pairs, grains)
+    )
     np.testing.assert_array_equal(network.used, np.arange(slots) < 3)
     np.testing.assert_array_equal(network.i[:3], i[picked])
     np.testing.assert_array_equal(network.j[:3], j[picked])
@@ -112,8 +130,12 @@ def test_network_holds_its_contacts_and_its_empty_slots_are_inert(slots):
     np.testing.assert_allclose(
         network.approach[:3], np.sum(normals * velocities[picked], axis=1), rtol=0, atol=1e3 * EPS
     )
-    np.testing.assert_allclose(network.inverse_mass_i[:3], 1 / np.asarray(grains.masses)[i[picked]], rtol=2 * EPS)
-    np.testing.assert_allclose(network.inverse_mass_j[:3], 1 / np.asarray(grains.masses)[j[picked]], rtol=2 * EPS)
+    np.testing.assert_allclose(
+        network.inverse_mass_i[:3], 1 / np.asarray(grains.masses)[i[picked]], rtol=2 * EPS
+    )
+    np.testing.assert_allclose(
+        network.inverse_mass_j[:3], 1 / np.asarray(grains.masses)[j[picked]], rtol=2 * EPS
+    )
     for name in ("normals", "approach", "inverse_mass_i", "inverse_mass_j"):
         assert np.all(getattr(network, name)[3:] == 0)
     assert np.all(np.isfinite(network.distances))
@@ -130,7 +152,9 @@ def test_touching_rule_reads_the_gap_alone(seed):
 
 def test_grains_at_rest_to_each_other_are_judged_by_their_gap():
     separations, reach = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.9]]), np.array([1.0, 0.99, 1.0])
-    contact, approaching = is_contact(motion(separations, np.zeros((3, 2))), reach, jnp.asarray(1e-2))
+    contact, approaching = is_contact(
+        motion(separations, np.zeros((3, 2))), reach, jnp.asarray(1e-2)
+    )
     np.testing.assert_array_equal(contact, [True, False, True])
     assert not np.any(approaching)
     time, _ = first_contact_time(motion(separations, np.zeros((3, 2))), reach)

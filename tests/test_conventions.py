@@ -18,7 +18,8 @@ from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import OBSERVABLES
 
-# A few variables of each group: the checker takes a time that grows with the square of the number of variables.
+# A few variables of each group: the checker takes a time that grows with the square of the number
+# of variables.
 KINDS = ("force_ratio", "stress_ratio", "local_granular", "max_overlap", "contact_stress")
 KINDS += (
     "enskog_pressure",
@@ -29,7 +30,8 @@ KINDS += (
     "force",
     "x",
 )
-# CF 7.3.4 accepts standard names, such as time, in cell_methods; the checker knows names of coordinates only.
+# CF 7.3.4 accepts standard names, such as time, in cell_methods; the checker knows names of
+# coordinates only.
 SKIPPED = ("--skip-checks", "check_cell_methods:M")
 
 
@@ -38,7 +40,9 @@ def made(**choices) -> xr.DataTree:
     settings = MapSettings((0.5, 0.9), (0.5, 0.6), seeds=2, strain=2.0, snapshots=True, **choices)
     rng, points = np.random.default_rng(0), len(settings.flows())
     found = {
-        (point, seed): random_replica(rng, settings, Status.ok, point)._replace(state=random_state(point))
+        (point, seed): random_replica(rng, settings, Status.ok, point)._replace(
+            state=random_state(point)
+        )
         for point in range(points)
         for seed in range(2)
     }
@@ -66,11 +70,15 @@ def as_a_file_of_its_own(data: xr.DataTree, group: str) -> xr.DataTree:
     part = part if "status" in part else part.assign(status=data.status)
     for variable in part.data_vars.values():
         if "ancillary_variables" in variable.attrs:
-            variable.attrs["ancillary_variables"] = variable.attrs["ancillary_variables"].replace("/", "")
+            variable.attrs["ancillary_variables"] = variable.attrs["ancillary_variables"].replace(
+                "/", ""
+            )
     return xr.DataTree(part.assign_attrs(data.attrs))
 
 
-@pytest.mark.skipif(find_spec("compliance_checker") is None, reason="compliance-checker is not installed")
+@pytest.mark.skipif(
+    find_spec("compliance_checker") is None, reason="compliance-checker is not installed"
+)
 def test_the_checker_of_the_conventions_finds_nothing(several, single, tmp_path: Path) -> None:
     files = []
     for data, groups in ((several, several.groups), (single, ("/",))):
@@ -79,7 +87,9 @@ def test_the_checker_of_the_conventions_finds_nothing(several, single, tmp_path:
             write_dataset(as_a_file_of_its_own(data, group), Path(files[-1]))
     checker = [sys.executable, str(Path(sys.executable).with_name("compliance-checker"))]
     test = f"--test={CONVENTIONS.lower().replace('-', ':')}"
-    done = subprocess.run([*checker, test, "--criteria=strict", *SKIPPED, *files], capture_output=True, text=True)
+    done = subprocess.run(
+        [*checker, test, "--criteria=strict", *SKIPPED, *files], capture_output=True, text=True
+    )
     assert "exceptions" not in done.stdout + done.stderr
     assert done.returncode == 0, done.stdout
     assert done.stdout.count("All tests passed") == len(files)
@@ -104,11 +114,17 @@ def test_units_are_those_of_pure_numbers_and_links_lead_to_variables(kind: str, 
         assert whole["cell_methods"].startswith("realization: time: ")
 
 
-def test_a_number_of_grains_and_a_time_step_of_all_points_are_coordinates(several, single, tmp_path: Path) -> None:
+def test_a_number_of_grains_and_a_time_step_of_all_points_are_coordinates(
+    several, single, tmp_path: Path
+) -> None:
     assert {"point_grains", "timestep"} <= set(single.coords) and "grains" not in single.coords
     assert single.force_ratio.timestep.item() == 5e-4
     one = made(grains=64, timestep=5e-4)
-    assert one.grains.item() == 64 and one.grains.dims == () and not {"grains", "timestep"} & set(one.data_vars)
+    assert (
+        one.grains.item() == 64
+        and one.grains.dims == ()
+        and not {"grains", "timestep"} & set(one.data_vars)
+    )
     write_dataset(one, tmp_path / "map.nc")
     again = open_map(tmp_path / "map.nc")
     assert set(again.coords) == set(one.coords)

@@ -1,4 +1,6 @@
-"""The corrected theory: its limits, the balance of energy, its laws, and errors that hold at other flows."""
+"""The corrected theory: its limits, the balance of energy, its laws, and errors that hold at other
+flows.
+"""
 
 import json
 from dataclasses import replace
@@ -16,7 +18,10 @@ from jaxgran.theory.enskog import collisional_transfer
 from jaxgran.theory.gaussian_moments import gaussian_moments
 
 ENSKOG = replace(MEASURED_LAWS, length=np.zeros(3), pairs=np.zeros(3))
-PLANE = [axis.ravel() for axis in np.meshgrid([0.0, 0.1, 0.3, 0.6, 0.9, 0.99], [0.01, 0.1, 0.4, 0.7, 0.83])]
+PLANE = [
+    axis.ravel()
+    for axis in np.meshgrid([0.0, 0.1, 0.3, 0.6, 0.9, 0.99], [0.01, 0.1, 0.4, 0.7, 0.83])
+]
 STATE = ("granular_temperature", "pressure", "shear_stress", "dissipation_rate")
 
 
@@ -28,7 +33,10 @@ def batched(laws_are_zero: bool = False):
 
 
 def test_without_corrections_the_theory_is_that_of_the_moments() -> None:
-    found, expected = batched(laws_are_zero=True)(*PLANE), jax.jit(jax.vmap(gaussian_moments))(*PLANE)
+    found, expected = (
+        batched(laws_are_zero=True)(*PLANE),
+        jax.jit(jax.vmap(gaussian_moments))(*PLANE),
+    )
     for name in STATE:
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-12)
     np.testing.assert_array_equal(found.correlation_length, 1)
@@ -59,16 +67,27 @@ def test_dissipation_is_enskogs_times_pairs_over_length() -> None:
 
     unknowns = jnp.array([0.1, -0.2]) * found.granular_temperature
     misfit = jax.jit(lambda x: jnp.stack([stresses(tensor_of(x))[0][1], stresses(tensor_of(x))[1]]))
-    target = jnp.stack([total[1], found.dissipation_rate * found.correlation_length / found.pair_factor])
+    target = jnp.stack(
+        [total[1], found.dissipation_rate * found.correlation_length / found.pair_factor]
+    )
     for _ in range(20):  # Newton: two unknowns of the tensor, from shear stress and dissipation
-        unknowns = unknowns - jnp.linalg.solve(jax.jacfwd(misfit)(unknowns), misfit(unknowns) - target)
+        unknowns = unknowns - jnp.linalg.solve(
+            jax.jacfwd(misfit)(unknowns), misfit(unknowns) - target
+        )
     np.testing.assert_allclose(misfit(unknowns), target, rtol=1e-10)
-    np.testing.assert_allclose(stresses(tensor_of(unknowns))[0][0], total[0], rtol=1e-8)  # the pressure follows
+    np.testing.assert_allclose(
+        stresses(tensor_of(unknowns))[0][0], total[0], rtol=1e-8
+    )  # the pressure follows
 
 
 def test_stresses_grow_with_the_square_of_the_shear_rate() -> None:
     slow, fast = corrected_shear(0.5, 0.6), corrected_shear(0.5, 0.6, 3.0)
-    for name, times in {"granular_temperature": 9, "pressure": 9, "shear_stress": 9, "dissipation_rate": 27}.items():
+    for name, times in {
+        "granular_temperature": 9,
+        "pressure": 9,
+        "shear_stress": 9,
+        "dissipation_rate": 27,
+    }.items():
         np.testing.assert_allclose(getattr(fast, name), times * getattr(slow, name), rtol=1e-12)
     np.testing.assert_allclose(fast.correlation_length, slow.correlation_length)
 
@@ -88,11 +107,14 @@ def test_derivatives_equal_finite_differences(point: tuple[float, float]) -> Non
 def test_grains_become_those_of_the_theory_in_the_elastic_limit() -> None:
     """L → 1 as 1 − α, R → 1 as its cube root, in dilute flow."""
     near, nearer = (corrected_shear(1 - x, 0.1) for x in (1e-3, 1e-6))
-    np.testing.assert_allclose((near.correlation_length - 1) / (nearer.correlation_length - 1), 1e3, rtol=0.05)
+    np.testing.assert_allclose(
+        (near.correlation_length - 1) / (nearer.correlation_length - 1), 1e3, rtol=0.05
+    )
     np.testing.assert_allclose((near.pair_factor - 1) / (nearer.pair_factor - 1), 10, rtol=1e-3)
 
 
-# ----------------------------------------------------------------------------- the committed results
+# ----------------------------------------------------------------------------- the committed
+# results
 
 
 @cache
@@ -108,14 +130,25 @@ def test_the_coefficients_are_those_of_the_benchmark() -> None:
     for words, of in ((MEASURED_LAWS.fitted_to, "map"), (MEASURED_LAWS.judged_on, "judged_on")):
         about = result()[of]
         digits = f"{about['timestep']:.0e}".replace("e-0", "e-")
-        sizes = " or ".join(str(size) for size in sorted({about["most_grains"], about["fewest_grains"]}, reverse=True))
+        sizes = " or ".join(
+            str(size)
+            for size in sorted({about["most_grains"], about["fewest_grains"]}, reverse=True)
+        )
         assert words == f"{about['points']} flows of N = {sizes}, dt = {digits}"
 
 
 def predicted_over_measured(points: list[dict], predicted: CorrectedShear) -> np.ndarray:
     """Logarithms for temperature, pressure and shear stress, (3, points)."""
-    measured = np.array([[one[name] for one in points] for name in ("local_temperature", "pressure", "shear_stress")])
-    return np.log(np.array([predicted.granular_temperature, predicted.pressure, predicted.shear_stress]) / measured)
+    measured = np.array(
+        [
+            [one[name] for one in points]
+            for name in ("local_temperature", "pressure", "shear_stress")
+        ]
+    )
+    return np.log(
+        np.array([predicted.granular_temperature, predicted.pressure, predicted.shear_stress])
+        / measured
+    )
 
 
 def test_errors_at_flows_that_were_not_fitted_have_the_size_that_is_quoted() -> None:
@@ -125,6 +158,8 @@ def test_errors_at_flows_that_were_not_fitted_have_the_size_that_is_quoted() -> 
     assert not {one["nu"] for one in result()["points"]} & set(nu)
     errors = predicted_over_measured(points, batched()(alpha, nu))
     scatter = np.sqrt(np.mean(errors**2, axis=1))
-    np.testing.assert_allclose(scatter, MEASURED_LAWS.scatter, rtol=5e-3)  # results are rounded to four digits
+    np.testing.assert_allclose(
+        scatter, MEASURED_LAWS.scatter, rtol=5e-3
+    )  # results are rounded to four digits
     plain = predicted_over_measured(points, batched(laws_are_zero=True)(alpha, nu))
     assert np.all(scatter < np.sqrt(np.mean(plain**2, axis=1)) / 2)

@@ -29,7 +29,9 @@ RUN = {"command": "jaxgran map", "wall_time_seconds": 12.0, "replica_steps_per_s
 
 @pytest.fixture(scope="module")
 def settings() -> MapSettings:
-    return MapSettings(ALPHAS, NUS, grains=64, seeds=SEEDS, timestep=5e-4, strain=2.0, activation="touching")
+    return MapSettings(
+        ALPHAS, NUS, grains=64, seeds=SEEDS, timestep=5e-4, strain=2.0, activation="touching"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,13 @@ def few(data) -> xr.DataTree:
 
 
 def test_every_observable_has_its_dimensions_and_errors(data) -> None:
-    assert data.sizes == {"packing_fraction": 2, "restitution": 2, "axis_a": 2, "axis_b": 2, "error_source": 5}
+    assert data.sizes == {
+        "packing_fraction": 2,
+        "restitution": 2,
+        "axis_a": 2,
+        "axis_b": 2,
+        "error_source": 5,
+    }
     for name, one in OBSERVABLES.items():
         tail, path = one.axes, path_of(name)
         assert data[path].dims == ("packing_fraction", "restitution", *tail)
@@ -64,7 +72,9 @@ def test_every_observable_has_its_dimensions_and_errors(data) -> None:
 
 
 @pytest.mark.parametrize("version", [None, 2])
-def test_a_file_of_another_format_is_refused_in_a_sentence(few, version: int | None, tmp_path: Path) -> None:
+def test_a_file_of_another_format_is_refused_in_a_sentence(
+    few, version: int | None, tmp_path: Path
+) -> None:
     other = few.copy()
     del other.attrs["format_version"]
     if version is not None:
@@ -83,7 +93,11 @@ def test_everything_has_a_long_name_and_numbers_have_units(data) -> None:
         "timestep": "1 / shear rate",
         "pressure_stderr": "m / t^2",
     }
-    by_hand |= {"pressure": "m / t^2", "granular_temperature": "m sigma^2 / t^2", "diagnostics/max_overlap": "sigma"}
+    by_hand |= {
+        "pressure": "m / t^2",
+        "granular_temperature": "m sigma^2 / t^2",
+        "diagnostics/max_overlap": "sigma",
+    }
     assert {name: data[name].attrs["reduced_unit"] for name in by_hand} == by_hand
 
 
@@ -92,7 +106,9 @@ def test_every_average_has_the_strain_of_an_independent_sample(data) -> None:
     assert set(strains.observable.values) == {
         name for name, one in OBSERVABLES.items() if not (one.tensor or one.extreme)
     }
-    block = data["seeds/strain"].mean("seed") / BLOCKS  # made-up blocks are independent, and no less can be resolved
+    block = (
+        data["seeds/strain"].mean("seed") / BLOCKS
+    )  # made-up blocks are independent, and no less can be resolved
     lengths = (strains.sel(observable="force_ratio") / block).values[0]
     assert np.all((lengths > 0.8) & (lengths < 4))
 
@@ -118,7 +134,9 @@ def test_factors_and_lengths_are_those_of_the_samples_of_a_point(settings, data,
     for there, name in stored.items():
         for ending in ("", "_stderr"):
             assert data["theory"][there + ending].dims == ("packing_fraction", "restitution")
-        np.testing.assert_array_equal([here[there], here[f"{there}_stderr"]], [value[name], error[name]])
+        np.testing.assert_array_equal(
+            [here[there], here[f"{there}_stderr"]], [value[name], error[name]]
+        )
 
 
 def test_elastic_flow_has_no_prediction() -> None:
@@ -130,7 +148,11 @@ def test_elastic_flow_has_no_prediction() -> None:
 
 def test_values_stand_at_their_point_and_seed(data, results) -> None:
     for (point, seed), replica in results.items():
-        there = {"packing_fraction": NUS[point // 2], "restitution": ALPHAS[point % 2], "seed": seed}
+        there = {
+            "packing_fraction": NUS[point // 2],
+            "restitution": ALPHAS[point % 2],
+            "seed": seed,
+        }
         assert data["seeds/status"].sel(there) == replica.status
         assert data["seeds/strain"].sel(there) == pytest.approx(replica.sample.tally.duration.sum())
         assert data["seeds/equilibration_strain"].sel(there) == replica.strain
@@ -138,7 +160,11 @@ def test_values_stand_at_their_point_and_seed(data, results) -> None:
 
 def test_point_is_the_ratio_of_the_sums_of_its_seeds_that_were_not_given_up(data, results) -> None:
     for point in range(4):
-        tallies = [r.sample.tally for (p, _), r in results.items() if p == point and r.status != Status.infeasible]
+        tallies = [
+            r.sample.tally
+            for (p, _), r in results.items()
+            if p == point and r.status != Status.infeasible
+        ]
         there = data.sel(packing_fraction=NUS[point // 2], restitution=ALPHAS[point % 2])
         ratio = sum(t.impulse.sum() for t in tallies) / sum(t.binary_impulse.sum() for t in tallies)
         assert there.force_ratio == pytest.approx(ratio)
@@ -149,10 +175,18 @@ def test_point_is_the_ratio_of_the_sums_of_its_seeds_that_were_not_given_up(data
 
 
 def test_worst_status_wins_and_is_a_cf_flag(data) -> None:
-    np.testing.assert_array_equal(data.status, [[Status.iteration_limit, Status.infeasible], [Status.ok, NOT_RUN]])
+    np.testing.assert_array_equal(
+        data.status, [[Status.iteration_limit, Status.infeasible], [Status.ok, NOT_RUN]]
+    )
     for name in ("status", "seeds/status"):
-        values, meanings = data[name].attrs["flag_values"], data[name].attrs["flag_meanings"].split()
-        assert dict(zip(values.tolist(), meanings, strict=True)) == {-1: "not_run", **{s.value: s.name for s in Status}}
+        values, meanings = (
+            data[name].attrs["flag_values"],
+            data[name].attrs["flag_meanings"].split(),
+        )
+        assert dict(zip(values.tolist(), meanings, strict=True)) == {
+            -1: "not_run",
+            **{s.value: s.name for s in Status},
+        }
         assert data[name].dtype == values.dtype
 
 
@@ -164,7 +198,10 @@ def test_replicas_that_were_given_up_have_failed(settings, results) -> None:
 
 
 def test_a_jammed_point_has_no_value(settings, results) -> None:
-    jammed = {key: one._replace(status=int(Status.infeasible)) if key[0] == 1 else one for key, one in results.items()}
+    jammed = {
+        key: one._replace(status=int(Status.infeasible)) if key[0] == 1 else one
+        for key, one in results.items()
+    }
     here = map_dataset(settings, jammed, RUN).sel(packing_fraction=NUS[0], restitution=ALPHAS[1])
     assert here.status == Status.infeasible
     for name in ("force_ratio", "pressure_stderr", "pressure_ci95", "stresses/contact_stress"):
@@ -196,7 +233,9 @@ def test_dataset_survives_the_disc(data, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["map.nc"]
 
 
-def test_failed_write_keeps_the_old_file_and_leaves_no_other(few, tmp_path: Path, monkeypatch) -> None:
+def test_failed_write_keeps_the_old_file_and_leaves_no_other(
+    few, tmp_path: Path, monkeypatch
+) -> None:
     path = tmp_path / "map.nc"
     write_dataset(few, path)
     old = path.read_bytes()
@@ -214,14 +253,18 @@ def test_failed_write_keeps_the_old_file_and_leaves_no_other(few, tmp_path: Path
     assert [p.name for p in tmp_path.iterdir()] == ["map.nc"]
 
 
-def test_files_without_a_checksum_are_read_and_every_flipped_bit_of_others_is_found(few, tmp_path: Path) -> None:
+def test_files_without_a_checksum_are_read_and_every_flipped_bit_of_others_is_found(
+    few, tmp_path: Path
+) -> None:
     path, rng = tmp_path / "map.nc", np.random.default_rng(0)
     few.to_netcdf(path, engine="netcdf4")
     assert open_map(path).equals(few)
     write_dataset(few, path)
     whole = path.read_bytes()
     for place in rng.integers(len(whole) - 40, size=50):
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << rng.integers(8)]) + whole[place + 1 :])
+        path.write_bytes(
+            whole[:place] + bytes([whole[place] ^ 1 << rng.integers(8)]) + whole[place + 1 :]
+        )
         with pytest.raises(ValueError, match="damaged"):
             open_map(path)
 
@@ -232,12 +275,20 @@ def test_errors_of_a_point_are_those_of_its_own_flow(settings, data) -> None:
             point = data.sel(packing_fraction=nu, restitution=alpha)
             point = flattened(point)
             numbers = {
-                path.split("/")[-1]: float(x) for path, x in point.items() if x.ndim == 0 and "theory" not in path
+                path.split("/")[-1]: float(x)
+                for path, x in point.items()
+                if x.ndim == 0 and "theory" not in path
             }
             errors = {name: numbers.get(f"{name}_stderr", np.nan) for name in numbers}
             numbers["contact_stress"] = point["stresses/contact_stress"].values
             budget = error_budget(
-                numbers, errors, alpha, nu, settings.grains, settings.timestep, settings.solver.tolerance
+                numbers,
+                errors,
+                alpha,
+                nu,
+                settings.grains,
+                settings.timestep,
+                settings.solver.tolerance,
             )
             for name, parts in budget.items():
                 for part in ("timestep", "size", "tolerance"):
@@ -251,17 +302,27 @@ def test_errors_of_a_point_are_those_of_its_own_flow(settings, data) -> None:
 
 def test_grains_chosen_by_point_are_in_the_file_and_change_the_error(tmp_path: Path) -> None:
     chosen = MapSettings(
-        ALPHAS, NUS, grains=1024, seeds=1, timestep=5e-4, error=0.1, grains_by_point=(64, 256, 256, 1024)
+        ALPHAS,
+        NUS,
+        grains=1024,
+        seeds=1,
+        timestep=5e-4,
+        error=0.1,
+        grains_by_point=(64, 256, 256, 1024),
     )
     assert [flow.grains for flow in chosen.flows()] == [64, 256, 256, 1024]
     rng = np.random.default_rng(0)
-    found = map_dataset(chosen, {(point, 0): random_replica(rng, chosen, Status.ok) for point in range(4)}, RUN)
+    found = map_dataset(
+        chosen, {(point, 0): random_replica(rng, chosen, Status.ok) for point in range(4)}, RUN
+    )
     np.testing.assert_array_equal(found.point_grains, [[64, 256], [256, 1024]])
     for k, grains in enumerate((64, 256, 256, 1024)):
         alpha, nu = ALPHAS[k % 2], NUS[k // 2]
         point = found.sel(packing_fraction=nu, restitution=alpha)
         size = float(size_error(alpha, nu, grains))
         expected = size / (1 - size)
-        assert float(point.pressure_ci95.sel(error_source="size") / abs(point.pressure)) == pytest.approx(expected)
+        assert float(
+            point.pressure_ci95.sel(error_source="size") / abs(point.pressure)
+        ) == pytest.approx(expected)
     write_dataset(with_variables(found, *FEW), tmp_path / "map.nc")
     assert MapSettings(**choices_of(open_map(tmp_path / "map.nc"))) == chosen

@@ -21,13 +21,18 @@ def test_the_line_is_short_whatever_stands_in_the_place_of_a_number(value) -> No
     """JAX fills its trees with tracers, axes, shapes and placeholders."""
     seen = [value]
     jax.jit(seen.append)(value)
-    seen += [jax.tree.map(lambda _, leaf=leaf: leaf, value) for leaf in (None, jax.ShapeDtypeStruct((3,), float))]
+    seen += [
+        jax.tree.map(lambda _, leaf=leaf: leaf, value)
+        for leaf in (None, jax.ShapeDtypeStruct((3,), float))
+    ]
     assert all(repr(one).startswith(type(value).__name__) and "\n" not in repr(one) for one in seen)
     assert len(repr(value)) < 700
 
 
 @given(st.floats(1e-12, 1e12), st.floats(1e-12, 1e12), st.sampled_from([-1, 1]))
-def test_rounding_moves_a_value_by_less_than_its_error_and_the_error_by_a_seventh(value, error, sign) -> None:
+def test_rounding_moves_a_value_by_less_than_its_error_and_the_error_by_a_seventh(
+    value, error, sign
+) -> None:
     digits, _, power = with_error(sign * value, error).strip("(").partition(")e")
     shown, rounded_error = (float(x) * 10.0 ** int(power or 0) for x in digits.split(" ± "))
     assert rounded_error == pytest.approx(error, rel=1 / 7)

@@ -1,4 +1,6 @@
-"""The documentation is complete: pages, names and links exist; examples of docstrings, pages and README run."""
+"""The documentation is complete: pages, names and links exist; examples of docstrings, pages and
+README run.
+"""
 
 import ast
 import copy
@@ -23,7 +25,9 @@ ROOT = Path(jaxgran.__file__).parents[1]
 PAPER = ROOT / "docs" / "paper"
 DOCS = ROOT / "docs"
 HIDDEN = {PAPER, DOCS / "_build"}  # from the site
-PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md") if not HIDDEN & {*path.parents})
+PAGES = sorted(
+    path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md") if not HIDDEN & {*path.parents}
+)
 SOURCES = sorted((ROOT / "jaxgran").rglob("*.py"))
 MODULES = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
@@ -39,13 +43,20 @@ def python_of(page: str) -> list[str]:
 
 
 EXECUTED = runpy.run_path(str(DOCS / "_build" / "executed.py"))
-RUN = ("../README.md", *(page for page in PAGES if python_of(page) and page not in EXECUTED["PAGES"]))
+RUN = (
+    "../README.md",
+    *(page for page in PAGES if python_of(page) and page not in EXECUTED["PAGES"]),
+)
 
 
 def test_navigation_names_every_page_once() -> None:
-    named = re.findall(r": ([\w/.-]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    named = re.findall(
+        r": ([\w/.-]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE
+    )
     notebooks = [f"notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")]
-    assert sorted(named) == sorted([*PAGES, *notebooks, "contributing.md", "changelog.md", "security.md"])
+    assert sorted(named) == sorted(
+        [*PAGES, *notebooks, "contributing.md", "changelog.md", "security.md"]
+    )
 
 
 def test_tests_that_pages_name_are_there() -> None:
@@ -56,20 +67,34 @@ def test_tests_that_pages_name_are_there() -> None:
 
 
 # Names of other programs and of examples, and endings of files
-FOREIGN = """ConstantMomentum NO_MKDOCS_2_WARNING as cell_size_too_small css csv data_columns dev dirty h5 hdf5
-    import install-completion jaxgran_map js lammpstrj lees_edwards lint-imports lowest mp4 nc ncdump no-caption
-    False null pandas pure_callback pyplot pyright pytest_cache read_csv select show-completion simulate src
-    tcp tsv txt vjp"""
-PLACEHOLDERS = "ADDRESS COMMAND DT FACTOR FILE FOLDER LIST NAME NUMBER PRESET RULE STRAIN STRESS TAU TOL"
-COMMANDS = "pip uv ruff pytest mkdocs chromium-driver sp-repo-review cut fix pair_style damping flip"
+FOREIGN = """ConstantMomentum NO_MKDOCS_2_WARNING as cell_size_too_small css csv data_columns
+    dev dirty h5 hdf5 import install-completion jaxgran_map js lammpstrj lees_edwards
+    lint-imports lowest mp4 nc ncdump no-caption False null pandas pure_callback pyplot pyright
+    pytest_cache read_csv select show-completion simulate src tcp tsv txt vjp"""
+PLACEHOLDERS = (
+    "ADDRESS COMMAND DT FACTOR FILE FOLDER LIST NAME NUMBER PRESET RULE STRAIN STRESS TAU TOL"
+)
+COMMANDS = (
+    "pip uv ruff pytest mkdocs chromium-driver sp-repo-review cut fix pair_style damping flip"
+)
 FOLDERS = ("", "jaxgran", "tests", "benchmarks", "docs", "notebooks", "benchmarks/results")
-_FIELDS = ("id", "attr", "name", "arg", "value")  # of syntax trees: names, attributes, definitions, arguments, strings
+_FIELDS = (
+    "id",
+    "attr",
+    "name",
+    "arg",
+    "value",
+)  # of syntax trees: names, attributes, definitions, arguments, strings
 
 
 def names_of_the_project() -> set[str]:
     """Identifiers and strings of the source code, files and folders, names in the file of a map."""
     names = {"jaxgran", *FOREIGN.split()}
-    files = [path for folder in ("benchmarks", "tests", "docs/_build") for path in (ROOT / folder).rglob("*.py")]
+    files = [
+        path
+        for folder in ("benchmarks", "tests", "docs/_build")
+        for path in (ROOT / folder).rglob("*.py")
+    ]
     for path in [*SOURCES, *files]:
         names.update(path.relative_to(ROOT).parts, [path.stem])
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -83,10 +108,16 @@ def names_of_the_project() -> set[str]:
 def unknown_names(code: str, names: set[str]) -> list[str]:
     """Names in a piece of code that do not exist."""
     first = code.split()[0]
-    if first in COMMANDS.split() or "=" in first or any((ROOT / folder / code).exists() for folder in FOLDERS):
+    if (
+        first in COMMANDS.split()
+        or "=" in first
+        or any((ROOT / folder / code).exists() for folder in FOLDERS)
+    ):
         return []
     words = re.findall(r"(?<![\w-])-*([A-Za-z_][\w-]*)", code)
-    words = [word for word in words if len(word) > 1 and not {*word.split("_")} & {*PLACEHOLDERS.split()}]
+    words = [
+        word for word in words if len(word) > 1 and not {*word.split("_")} & {*PLACEHOLDERS.split()}
+    ]
     return [word for word in words if not {word, word.replace("-", "_")} & names]
 
 
@@ -94,13 +125,24 @@ def test_every_name_in_backticks_exists() -> None:
     names = names_of_the_project()
     unknown = {}
     for path in [ROOT / "CONTRIBUTING.md", *(DOCS / page for page in PAGES)]:
-        text = re.sub(r"^ *```.*?^ *```$", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+        text = re.sub(
+            r"^ *```.*?^ *```$",
+            "",
+            path.read_text(encoding="utf-8"),
+            flags=re.MULTILINE | re.DOTALL,
+        )
         codes = sorted(set(re.findall(r"`([^`\n]+)`", text)))
-        unknown |= {f"{path.name}: {code}": found for code in codes if (found := unknown_names(code, names))}
-    assert not unknown, "\n".join(f"{place} has {', '.join(found)}" for place, found in unknown.items())
+        unknown |= {
+            f"{path.name}: {code}": found for code in codes if (found := unknown_names(code, names))
+        }
+    assert not unknown, "\n".join(
+        f"{place} has {', '.join(found)}" for place, found in unknown.items()
+    )
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if "{{" in (DOCS / page).read_text(encoding="utf-8")])
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if "{{" in (DOCS / page).read_text(encoding="utf-8")]
+)
 def test_measured_numbers_of_a_page_come_from_files(page: str) -> None:
     text = (DOCS / page).read_text(encoding="utf-8")
     filled = pages.filled(text)
@@ -116,7 +158,9 @@ def test_a_changed_result_changes_the_page(monkeypatch: pytest.MonkeyPatch) -> N
     before = pages.filled(text)
     changed = copy.deepcopy(pages.read("step_cost"))
     changed["points"][0]["jaxgran_us"] *= 1.5
-    monkeypatch.setattr(pages, "read", lambda name, read=pages.read: changed if name == "step_cost" else read(name))
+    monkeypatch.setattr(
+        pages, "read", lambda name, read=pages.read: changed if name == "step_cost" else read(name)
+    )
     lines = zip(before.splitlines(), pages.filled(text).splitlines(), strict=True)
     changed_lines = [one for one, other in lines if one != other]
     assert len(changed_lines) == 1 and changed_lines[0].startswith("| 0.9 | 0.56 |")
@@ -141,7 +185,9 @@ def test_examples_of_docstrings_hold(module: str) -> None:
 @pytest.mark.parametrize("page", pages.TEMPLATES)
 def test_readme_and_paper_are_those_of_the_results(page: str) -> None:
     """``python -m benchmarks.pages`` makes them anew."""
-    written, template = ((ROOT / name).read_text(encoding="utf-8") for name in (page, pages.TEMPLATES[page]))
+    written, template = (
+        (ROOT / name).read_text(encoding="utf-8") for name in (page, pages.TEMPLATES[page])
+    )
     assert written == pages.filled(template)
 
 
@@ -158,8 +204,13 @@ def test_python_of_a_page_runs(page: str, tmp_path: Path) -> None:
     code = "\n".join(python_of(page))
     script = tmp_path / "page.py"
     script.write_text(code, encoding="utf-8")
-    environment = os.environ | {"MPLBACKEND": "agg", "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir}
-    done = subprocess.run([sys.executable, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    environment = os.environ | {
+        "MPLBACKEND": "agg",
+        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
+    }
+    done = subprocess.run(
+        [sys.executable, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -172,7 +223,9 @@ def test_an_executed_page_shows_what_its_blocks_print_and_draw(page: str) -> Non
     assert all(line in shown for line in written.splitlines())
     texts = re.findall(r"^```text\n(.+?)^```$", shown, re.MULTILINE | re.DOTALL)
     assert pictures and all(f"]({file})" in shown for file in pictures)
-    assert len(texts) + len(pictures) == len(re.findall(r"^```(?:python|shell)$", written, re.MULTILINE))
+    assert len(texts) + len(pictures) == len(
+        re.findall(r"^```(?:python|shell)$", written, re.MULTILINE)
+    )
     assert all(text.strip() for text in texts)
 
 

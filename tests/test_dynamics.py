@@ -1,4 +1,6 @@
-"""The advance over many steps: exact flight, the same trajectory by every route, statuses, batch_advance."""
+"""The advance over many steps: exact flight, the same trajectory by every route, statuses,
+batch_advance.
+"""
 
 from dataclasses import replace
 
@@ -37,7 +39,9 @@ UNCHANGED = {"numba": 0, "jax": 4 * EPS}
 
 
 def test_grain_flies_straight_in_the_laboratory(engine_run, scene):
-    """Over many steps, three remaps of the tilt and across the boundary, where the image is faster by γ̇L."""
+    """Over many steps, three remaps of the tilt and across the boundary, where the image is faster
+    by γ̇L.
+    """
     state = scene([[3.0, 4.0]], [[0.5, 1.7]])
     flow, steps = flow_of(0.02), 3200
     after, tally = engine_run(flow, state, steps)
@@ -46,7 +50,9 @@ def test_grain_flies_straight_in_the_laboratory(engine_run, scene):
     travelled = np.array([[3.0 + 0.5 * time, 4.0 + 1.7 * time]])
     missed = displacement(after.positions[:1], jnp.asarray(travelled), after.side, after.tilt)
     np.testing.assert_allclose(missed, 0, atol=1e3 * EPS * float(state.side))
-    np.testing.assert_allclose(after.velocities[0], [0.5 - travelled[0, 1], 1.7], rtol=0, atol=1e4 * EPS)
+    np.testing.assert_allclose(
+        after.velocities[0], [0.5 - travelled[0, 1], 1.7], rtol=0, atol=1e4 * EPS
+    )
     np.testing.assert_allclose(after.tilt, tilt, rtol=0, atol=1e4 * EPS)
     assert (tally.steps, tally.solves, tally.impulse, tally.status) == (steps, 0, 0, Status.ok)
     np.testing.assert_allclose(tally.duration, time, rtol=1e3 * EPS)
@@ -54,9 +60,13 @@ def test_grain_flies_straight_in_the_laboratory(engine_run, scene):
 
 @pytest.mark.parametrize("packing_fraction", [0.6, 0.75])
 @pytest.mark.parametrize("activation", ["midpoint", "touching"])
-def test_free_flight_repeats_the_trajectory_of_every_step(run, flowing, activation, packing_fraction):
+def test_free_flight_repeats_the_trajectory_of_every_step(
+    run, flowing, activation, packing_fraction
+):
     flow, state = flow_of(packing_fraction, activation=activation), flowing(packing_fraction)
-    (jumped, tally), (stepped, all_steps) = (run(flow, state, 100, free_flight) for free_flight in (True, False))
+    (jumped, tally), (stepped, all_steps) = (
+        run(flow, state, 100, free_flight) for free_flight in (True, False)
+    )
     assert tally.solves > 5
     assert_same_state(jumped, stepped, 1e-10)
     assert_same_tally(tally, all_steps, 1e-10)
@@ -94,21 +104,30 @@ def test_network_of_a_state_is_that_of_the_overlaps_by_brute_force(run, flowing)
     network, status = jax.jit(contacts_now)(flow, state)
     assert status == Status.ok
     gaps = gaps_of(state.positions, state.grains.radii, state.side, state.tilt)
-    found = {(min(i, j), max(i, j)) for i, j in np.stack([network.i, network.j], axis=1)[np.asarray(network.used)]}
+    found = {
+        (min(i, j), max(i, j))
+        for i, j in np.stack([network.i, network.j], axis=1)[np.asarray(network.used)]
+    }
     assert found == set(zip(*np.nonzero(gaps <= 0), strict=True)) and len(found) > 3
     depths = state.grains.radii[network.i] + state.grains.radii[network.j] - network.distances
-    np.testing.assert_allclose(np.sort(depths[network.used]), np.sort(-gaps[gaps <= 0]), atol=64 * EPS)
+    np.testing.assert_allclose(
+        np.sort(depths[network.used]), np.sort(-gaps[gaps <= 0]), atol=64 * EPS
+    )
 
 
 def test_deep_overlap_is_reported(engine_run, scene):
     for overlap, expected in ((0.02, Status.deep_overlap), (0.005, Status.ok)):
-        _, tally = engine_run(flow_of(0.02), scene([[5, 5], [6 - overlap, 5]], [[1.0, 0], [-1.0, 0]]), 1)
+        _, tally = engine_run(
+            flow_of(0.02), scene([[5, 5], [6 - overlap, 5]], [[1.0, 0], [-1.0, 0]]), 1
+        )
         assert (tally.outcome, tally.status) == (expected, Status.ok)
         np.testing.assert_allclose(tally.largest_overlap, overlap, rtol=0, atol=8 * EPS)
 
 
 def test_cap_of_iterations_is_reported(engine_run, flowing):
-    state, tally = engine_run(flow_of(0.75, restitution=0.1), flowing(0.75), 100, BarzilaiBorwein(1e-12, 1))
+    state, tally = engine_run(
+        flow_of(0.75, restitution=0.1), flowing(0.75), 100, BarzilaiBorwein(1e-12, 1)
+    )
     assert tally.status == Status.iteration_limit
     assert 0 < tally.unconverged <= tally.solves
     assert np.all(np.isfinite(state.velocities))
@@ -129,7 +148,9 @@ def test_pairs_that_the_lists_cannot_hold_are_reported(engine_run, flowing):
 
 
 @pytest.mark.parametrize("packing_fraction", [0.6, 0.82])
-def test_sizes_of_the_contact_buffers_change_no_trajectory(run, flowing, monkeypatch, packing_fraction):
+def test_sizes_of_the_contact_buffers_change_no_trajectory(
+    run, flowing, monkeypatch, packing_fraction
+):
     """More contacts than the largest buffer holds are solved on the list of near pairs."""
     state, flow = flowing(packing_fraction), flow_of(packing_fraction, restitution=0.1)
     expected, tally = run(flow, state, 50)
@@ -174,7 +195,8 @@ def traced_batch(replicas):
 @pytest.fixture(scope="module")
 def batch_advance(traced_batch):
     """The advance of all replicas at once; one after the other, they do not meet."""
-    # Sums of loops by the older emitter depend on what else is in an array; users have the newer one.
+    # Sums of loops by the older emitter depend on what else is in an array; users have the newer
+    # one.
     return traced_batch.lower().compile({"xla_cpu_use_fusion_emitters": True})
 
 
@@ -195,14 +217,18 @@ def test_batch_advances_as_single_runs_do(run, replicas, batch_advance):
         assert_same_tally(replica(tallies, index), tally, 1e-10)
 
 
-def test_replica_is_the_same_to_the_bit_whatever_its_neighbours(flowing, replicas, batch_advance, healthy):
+def test_replica_is_the_same_to_the_bit_whatever_its_neighbours(
+    flowing, replicas, batch_advance, healthy
+):
     others = stacked([flowing(0.6), flowing(0.8, 1), flowing(0.1, 1)])
     changed = batch_advance(replicas[0], others, jnp.int32(200))
     assert_same_bits(replica(healthy, 0), replica(changed, 0))
 
 
 @pytest.mark.parametrize("field", ["positions", "velocities"])
-def test_replica_that_is_not_finite_leaves_the_others_alone(replicas, batch_advance, healthy, field):
+def test_replica_that_is_not_finite_leaves_the_others_alone(
+    replicas, batch_advance, healthy, field
+):
     flows, states = replicas
     spoilt = replace(states, **{field: getattr(states, field).at[1, 0, 0].set(jnp.nan)})
     result = batch_advance(flows, spoilt, jnp.int32(200))
@@ -218,16 +244,25 @@ def equations_of(jaxpr) -> list:
 
 
 def test_control_flow_of_a_batch_stays_control_flow(traced_batch):
-    """A branch or loop on a predicate that differs between replicas would pay for all branches, for all replicas."""
-    least = 3 + len(contact_buffers(GRAINS))  # the loops over lists and events, and a solve of each size and of all
+    """A branch or loop on a predicate that differs between replicas would pay for all branches, for
+    all replicas.
+    """
+    least = 3 + len(
+        contact_buffers(GRAINS)
+    )  # the loops over lists and events, and a solve of each size and of all
     for name in ("cond", "while"):
-        found = [each for each in equations_of(traced_batch.jaxpr.jaxpr) if each.primitive.name == name]
+        found = [
+            each for each in equations_of(traced_batch.jaxpr.jaxpr) if each.primitive.name == name
+        ]
         assert len(found) >= least
         for equation in found:
             if name == "cond":
                 assert equation.invars[0].aval.shape == ()
             else:  # a batched predicate would be reduced over the replicas outside pmax
-                inside = [each.primitive.name for each in equations_of(equation.params["cond_jaxpr"].jaxpr)]
+                inside = [
+                    each.primitive.name
+                    for each in equations_of(equation.params["cond_jaxpr"].jaxpr)
+                ]
                 assert "reduce_or" not in inside
 
 
@@ -235,7 +270,11 @@ def test_single_precision_stays_single(flowing):
     flow, state = (jax.tree.map(jnp.float32, tree) for tree in (flow_of(), flowing(0.6)))
     solver = BarzilaiBorwein(jnp.float32(1e-4), jnp.int32(99))
     state, tally = jax.eval_shape(advance_by_jax, flow, solver, state, jnp.int32(3))
-    numbers = [leaf.dtype for leaf in jax.tree.leaves((state, tally)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    numbers = [
+        leaf.dtype
+        for leaf in jax.tree.leaves((state, tally))
+        if jnp.issubdtype(leaf.dtype, jnp.floating)
+    ]
     assert set(numbers) == {jnp.dtype("float32")}
 
 
@@ -246,6 +285,8 @@ def test_a_cell_narrower_than_two_diameters_is_reported(engine_run):
     places = np.stack([0.3 * np.arange(GRAINS) + 0.2, np.full(GRAINS, 9.5)], axis=1)
     places[:2] = [[2.0, 3.0], [7.1, 3.0]]
     grains = Grains(jnp.asarray(radii), jnp.asarray(4 * radii**2))
-    state = State(grains, jnp.asarray(places), jnp.zeros((GRAINS, 2)), jnp.asarray(10.2), jnp.asarray(0.0))
+    state = State(
+        grains, jnp.asarray(places), jnp.zeros((GRAINS, 2)), jnp.asarray(10.2), jnp.asarray(0.0)
+    )
     _, tally = engine_run(flow_of(0.8, shear_rate=0.0), state, 2)
     assert tally.status >= Status.capacity

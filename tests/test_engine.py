@@ -1,4 +1,6 @@
-"""An engine has a name: it runs what it can, refuses in a sentence what it cannot, and stands in what it has made."""
+"""An engine has a name: it runs what it can, refuses in a sentence what it cannot, and stands in
+what it has made.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -46,7 +48,12 @@ def refusal(call) -> str:
 
 def test_auto_takes_the_machine_code_where_it_can_and_jax_elsewhere(flowing) -> None:
     state = flowing(0.7)
-    assert selected() == selected(state) == selected(state, solver=jg.BarzilaiBorwein(1e-9, 7)) == "numba"
+    assert (
+        selected()
+        == selected(state)
+        == selected(state, solver=jg.BarzilaiBorwein(1e-9, 7))
+        == "numba"
+    )
     assert selected(state, solver=jg.Nesterov()) == "jax"
     assert selected(single(state)) == "jax"
     assert selected(state, "events") == "jax"
@@ -55,7 +62,9 @@ def test_auto_takes_the_machine_code_where_it_can_and_jax_elsewhere(flowing) -> 
 def test_a_state_of_several_precisions_is_one_sentence(flowing) -> None:
     mixed = replace(single(flowing(0.7)), side=flowing(0.7).side)
     for call in (lambda: jg.advance(of(), mixed, STEPS), lambda: jg.sample(of(), mixed, 0.1)):
-        assert refusal(call).startswith("state must be of one precision, and its numbers are float32 and float64: ")
+        assert refusal(call).startswith(
+            "state must be of one precision, and its numbers are float32 and float64: "
+        )
 
 
 def test_single_precision_that_was_not_asked_for_is_one_warning(flowing) -> None:
@@ -76,7 +85,10 @@ IMPOSSIBLE = {
     ),
     "single precision": (
         lambda state: jg.advance(of(), single(state), STEPS, engine=jg.Numba()),
-        "in float32, not numba: it runs on the device cpu, in float64, with the solver barzilai-borwein",
+        (
+            "in float32, not numba: it runs on the device cpu, in float64, with the solver "
+            "barzilai-borwein"
+        ),
     ),
     "moving contacts": (
         lambda state: jg.advance(of(), state, STEPS, moving_contacts=True, engine=jg.Numba()),
@@ -85,7 +97,9 @@ IMPOSSIBLE = {
     "derivatives in reverse mode": (
         lambda state: jax.grad(
             lambda alpha: jnp.sum(
-                jg.advance(replace(of(), restitution=alpha), state, STEPS, events=50, engine=jg.Numba())[0].velocities
+                jg.advance(
+                    replace(of(), restitution=alpha), state, STEPS, events=50, engine=jg.Numba()
+                )[0].velocities
                 ** 2
             )
         )(0.5),
@@ -105,14 +119,21 @@ def test_an_engine_that_cannot_do_what_is_asked_says_so(case: str, flowing) -> N
 
 
 def test_the_machine_code_by_name_is_auto_to_the_bit(flowing) -> None:
-    state, (numba, auto) = flowing(0.7), (jax.jit(partial(jg.advance, engine=one)) for one in (jg.Numba(), None))
+    state, (numba, auto) = (
+        flowing(0.7),
+        (jax.jit(partial(jg.advance, engine=one)) for one in (jg.Numba(), None)),
+    )
     assert_same_bits(numba(of(), state, STEPS), auto(of(), state, STEPS))
 
 
 def test_jax_by_name_is_the_plain_advance(flowing, monkeypatch) -> None:
     monkeypatch.setattr(advance, "advance_by_jax", lambda *arguments, **_: arguments)
     monkeypatch.setattr(advance, "in_batch", lambda: True)  # so that nothing is traced
-    for numerics in ({"engine": jg.Jax()}, {"solver": jg.Jacobi()}, {"engine": jg.Jax(), "solver": jg.Jacobi()}):
+    for numerics in (
+        {"engine": jg.Jax()},
+        {"solver": jg.Jacobi()},
+        {"engine": jg.Jax(), "solver": jg.Jacobi()},
+    ):
         solver = numerics.get("solver", jg.BarzilaiBorwein())
         arguments = jg.advance(of(), flowing(0.7), STEPS, **numerics)
         assert arguments == (of(), solver, flowing(0.7), STEPS, True, None, False)
@@ -131,11 +152,16 @@ def test_jax_by_name_is_the_plain_advance(flowing, monkeypatch) -> None:
         ({"engine": jg.Jax(), "solver": jg.Jacobi(relaxation=1.5)}, "jax", "jacobi"),
     ],
 )
-def test_a_dataset_names_what_ran_and_what_was_asked_for(asked: dict, engine: str, solver: str) -> None:
+def test_a_dataset_names_what_ran_and_what_was_asked_for(
+    asked: dict, engine: str, solver: str
+) -> None:
     settings = replace(SETTINGS, **asked)
     data = map_dataset(settings, {}, {})
     assert (data.attrs["engine"], data.attrs["solver"]) == (engine, solver)
-    requested = "auto" if settings.engine is None else settings.engine.name, solver_name(settings.solver)
+    requested = (
+        "auto" if settings.engine is None else settings.engine.name,
+        solver_name(settings.solver),
+    )
     assert (data.attrs["engine_requested"], data.attrs["solver_requested"]) == requested
     assert (data.attrs["tolerance"], data.attrs["max_steps"]) == (settings.solver.tolerance, 5000)
     assert MapSettings(**choices_of(data)) == settings
@@ -144,7 +170,9 @@ def test_a_dataset_names_what_ran_and_what_was_asked_for(asked: dict, engine: st
 def test_in_single_precision_a_map_is_of_the_engine_jax() -> None:
     with jax.enable_x64(False):
         data = map_dataset(SETTINGS, {}, {})
-        assert "in float32, not numba" in refusal(lambda: replace(SETTINGS, engine=jg.Numba()).require_engine())
+        assert "in float32, not numba" in refusal(
+            lambda: replace(SETTINGS, engine=jg.Numba()).require_engine()
+        )
     assert (data.attrs["precision"], data.attrs["engine"], data.attrs["solver"]) == (
         "float32",
         "jax",
@@ -165,11 +193,13 @@ def test_the_default_device_chooses_the_engine_not_the_backend(flowing, monkeypa
 
 def test_an_axis_of_the_user_is_not_taken_for_the_replicas_of_a_batch(flowing) -> None:
     batch = jax.tree.map(lambda x: x[None], flowing(0.7))
-    run = jax.vmap(lambda one: jg.advance(of(), one, STEPS, engine=jg.Numba())[1].steps, axis_name="replica")
+    run = jax.vmap(
+        lambda one: jg.advance(of(), one, STEPS, engine=jg.Numba())[1].steps, axis_name="replica"
+    )
     assert run(batch) == float(STEPS)
 
 
 def test_an_advance_refuses_a_state_of_another_packing_fraction(flowing) -> None:
-    assert refusal(lambda: jg.advance(replace(of(), packing_fraction=0.6), flowing(0.7), STEPS)).startswith(
-        "packing_fraction must be 0.7, which the state has, not 0.6"
-    )
+    assert refusal(
+        lambda: jg.advance(replace(of(), packing_fraction=0.6), flowing(0.7), STEPS)
+    ).startswith("packing_fraction must be 0.7, which the state has, not 0.6")

@@ -1,4 +1,6 @@
-"""Stresses and dissipation rate are Enskog's times five factors, each of which is one where its assumption holds."""
+"""Stresses and dissipation rate are Enskog's times five factors, each of which is one where its
+assumption holds.
+"""
 
 from dataclasses import replace
 
@@ -29,19 +31,27 @@ FLOW = jg.ShearFlow(GRAINS, ALPHA, NU, 1e-3, polydispersity=0.0)
 
 
 def chaotic_tally(
-    rng: np.random.Generator, waves: float = 1.0, pairs: float = 1.0, speed: float = 1.0, impulse: float = 1.0
+    rng: np.random.Generator,
+    waves: float = 1.0,
+    pairs: float = 1.0,
+    speed: float = 1.0,
+    impulse: float = 1.0,
 ) -> Tally:
-    """Sums of a block of collisions of equal discs at random, with independent velocities of a temperature tensor.
+    """Sums of a block of collisions of equal discs at random, with independent velocities of a
+    temperature tensor.
 
-    The granular temperature is so many times the local one, which is that of the collisions. The pairs at contact are
-    so many times those of the theory, their speeds of approach and impulses so many times those of independent
-    velocities and of binary collisions. Pairs are drawn, and each stands for the rate w at which it collides.
+    The granular temperature is so many times the local one, which is that of the collisions. The
+    pairs at contact are so many times those of the theory, their speeds of approach and impulses so
+    many times those of independent velocities and of binary collisions. Pairs are drawn, and each
+    stands for the rate w at which it collides.
     """
     angle = rng.uniform(0, 2 * np.pi, COLLISIONS)
     n = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     w = rng.normal(-n[:, 0] * n[:, 1], np.sqrt(2 * np.einsum("ca,ab,cb->c", n, TENSOR, n)))
     w = speed * np.maximum(w, 0)
-    rate = pairs * (GRAINS**2 / AREA / 2) * float(contact_value(NU)) * 2 * np.pi / COLLISIONS * w  # of each pair
+    rate = (
+        pairs * (GRAINS**2 / AREA / 2) * float(contact_value(NU)) * 2 * np.pi / COLLISIONS * w
+    )  # of each pair
     binary, moments = (1 + ALPHA) / 2 * w, np.einsum("ca,cb->cab", n, n)
     sums = {
         "binary_moment": np.einsum("c,cab->ab", rate * binary, moments) * DURATION,
@@ -52,7 +62,11 @@ def chaotic_tally(
         "duration": np.float64(DURATION),
     }
     measured = {"contact_moment": sums["binary_moment"], "dissipation": sums["binary_dissipation"]}
-    return replace(empty_tally(np.dtype(float)), **{name: impulse * one for name, one in measured.items()}, **sums)
+    return replace(
+        empty_tally(np.dtype(float)),
+        **{name: impulse * one for name, one in measured.items()},
+        **sums,
+    )
 
 
 def sample_of(tallies: list[Tally], grains: int = GRAINS, area: float = AREA) -> Sample:
@@ -80,10 +94,17 @@ def test_factors_times_enskog_are_what_is_measured(engines, flowing, packing_fra
     measured = measured_rates(sample)
     for rate in RATES:
         factors = [value[f"{rate}_{factor}"] for factor in FACTORS]
-        assert np.prod(factors) * value[f"enskog_{rate}"] == pytest.approx(measured[rate], rel=1e-12)
-        assert all(error[f"{rate}_{factor}"] > 0 for factor in ("local_temperature", "anisotropy", "chaos", "pairs"))
+        assert np.prod(factors) * value[f"enskog_{rate}"] == pytest.approx(
+            measured[rate], rel=1e-12
+        )
+        assert all(
+            error[f"{rate}_{factor}"] > 0
+            for factor in ("local_temperature", "anisotropy", "chaos", "pairs")
+        )
     chaotic = {
-        rate: value[f"enskog_{rate}"] * value[f"{rate}_local_temperature"] * value[f"{rate}_anisotropy"]
+        rate: value[f"enskog_{rate}"]
+        * value[f"{rate}_local_temperature"]
+        * value[f"{rate}_anisotropy"]
         for rate in RATES
     }
     length = chaotic["dissipation_rate"] / measured["dissipation_rate"]
@@ -95,7 +116,11 @@ def test_factors_times_enskog_are_what_is_measured(engines, flowing, packing_fra
 def test_steady_flow_dissipates_the_power_of_its_shear(engines, flowing) -> None:
     value, error = estimates([sheared(engines, flowing, 0.75, 600)])
     off = value["dissipation_rate"] - value["shear_stress"]  # at a shear rate of one
-    assert abs(off) < 3 * np.hypot(error["dissipation_rate"], error["shear_stress"]) < 0.2 * value["shear_stress"]
+    assert (
+        abs(off)
+        < 3 * np.hypot(error["dissipation_rate"], error["shear_stress"])
+        < 0.2 * value["shear_stress"]
+    )
 
 
 def test_factors_of_chaos_are_one() -> None:
@@ -103,7 +128,9 @@ def test_factors_of_chaos_are_one() -> None:
     for rate in RATES:
         assert value[f"{rate}_binary"] == 1
         assert value[f"{rate}_local_temperature"] == pytest.approx(1, rel=1e-12)
-        assert value[f"{rate}_anisotropy"] > 1  # T_xy < 0 adds to the speeds along which the shear pushes
+        assert (
+            value[f"{rate}_anisotropy"] > 1
+        )  # T_xy < 0 adds to the speeds along which the shear pushes
         for factor in ("chaos", "pairs"):
             off = abs(value[f"{rate}_{factor}"] - 1)
             assert off < 4 * error[f"{rate}_{factor}"] < 0.1
@@ -119,8 +146,12 @@ def test_factors_of_chaos_are_one() -> None:
         ("speed", 0.5, {"chaos": 0.25, "dissipation_rate_chaos": 0.125}),
     ],
 )
-def test_a_change_of_collisions_is_found_in_its_own_factor(made: str, times: float, expected: dict) -> None:
-    chaotic, failing = (measured_over_enskog(FLOW, [chaotic_sample(2, **{made: x})])[0] for x in (1.0, times))
+def test_a_change_of_collisions_is_found_in_its_own_factor(
+    made: str, times: float, expected: dict
+) -> None:
+    chaotic, failing = (
+        measured_over_enskog(FLOW, [chaotic_sample(2, **{made: x})])[0] for x in (1.0, times)
+    )
     for rate in RATES:
         for factor in FACTORS:
             change = failing[f"{rate}_{factor}"] / chaotic[f"{rate}_{factor}"]
@@ -131,13 +162,20 @@ def test_a_change_of_collisions_is_found_in_its_own_factor(made: str, times: flo
 def test_long_waves_change_the_granular_temperature_alone() -> None:
     calm, waving = (measured_over_enskog(FLOW, [chaotic_sample(2, waves=x)])[0] for x in (1.0, 2.0))
     lengths = ("correlation_length", "correlation_length_from_pressure")
-    kept = [f"{rate}_{factor}" for rate in RATES for factor in FACTORS if factor != "local_temperature"]
+    kept = [
+        f"{rate}_{factor}" for rate in RATES for factor in FACTORS if factor != "local_temperature"
+    ]
     for name in (*kept, *lengths):
         assert waving[name] == pytest.approx(calm[name], rel=1e-9), name
-    enskog = momentum_and_energy(2 * np.trace(TENSOR) / 2), momentum_and_energy(np.trace(TENSOR) / 2)
+    enskog = (
+        momentum_and_energy(2 * np.trace(TENSOR) / 2),
+        momentum_and_energy(np.trace(TENSOR) / 2),
+    )
     for rate in RATES:
         assert waving[f"enskog_{rate}"] == pytest.approx(enskog[0][rate], rel=1e-9)
-        assert waving[f"{rate}_local_temperature"] == pytest.approx(enskog[1][rate] / enskog[0][rate], rel=1e-9)
+        assert waving[f"{rate}_local_temperature"] == pytest.approx(
+            enskog[1][rate] / enskog[0][rate], rel=1e-9
+        )
 
 
 def momentum_and_energy(temperature: float) -> dict[str, float]:
@@ -152,8 +190,14 @@ def momentum_and_energy(temperature: float) -> dict[str, float]:
 
 
 def test_no_collisions_have_no_factors_but_enskogs_rates() -> None:
-    still = {"kinetic_moment": GRAINS * TENSOR, "local_kinetic": np.float64(1.0), "duration": np.float64(1.0)}
-    value, _ = measured_over_enskog(FLOW, [sample_of([replace(empty_tally(np.dtype(float)), **still)] * 2)])
+    still = {
+        "kinetic_moment": GRAINS * TENSOR,
+        "local_kinetic": np.float64(1.0),
+        "duration": np.float64(1.0),
+    }
+    value, _ = measured_over_enskog(
+        FLOW, [sample_of([replace(empty_tally(np.dtype(float)), **still)] * 2)]
+    )
     missing = [f"{rate}_{factor}" for rate in RATES for factor in ("chaos", "pairs", "binary")]
     assert np.isnan([value[name] for name in (*missing, "correlation_length")]).all()
     assert all(value[f"enskog_{rate}"] > 0 for rate in RATES)

@@ -1,4 +1,6 @@
-"""The event-driven reference obeys conservation laws, Enskog's rate and its own law of a collision."""
+"""The event-driven reference obeys conservation laws, Enskog's rate and its own law of a
+collision.
+"""
 
 import numpy as np
 import pytest
@@ -9,8 +11,12 @@ from benchmarks.independent.event_driven import Discs, Law, averages, sheared
 ROUNDING = 1e-12
 
 
-def lattice(across: int, packing_fraction: float, polydispersity: float = 0.26, seed: int = 0) -> Discs:
-    """Discs on a square lattice, with random velocities of temperature one and no total momentum."""
+def lattice(
+    across: int, packing_fraction: float, polydispersity: float = 0.26, seed: int = 0
+) -> Discs:
+    """Discs on a square lattice, with random velocities of temperature one and no total
+    momentum.
+    """
     rng, count = np.random.default_rng(seed), across**2
     diameters = rng.permutation(1 + polydispersity * (2 * (np.arange(count) + 0.5) / count - 1))
     side = np.sqrt(np.pi / 4 * np.sum(diameters**2) / packing_fraction)
@@ -46,12 +52,16 @@ def test_power_of_the_shear_is_dissipated_or_heats_the_discs(flow) -> None:
     before, after, sums, law = flow
     work = averages(sums, after)["shear_stress"] * law.shear_rate * sums["duration"] * after.side**2
     assert work > 10
-    np.testing.assert_allclose(work, sums["dissipation"] + energy(after) - energy(before), rtol=1e-10)
+    np.testing.assert_allclose(
+        work, sums["dissipation"] + energy(after) - energy(before), rtol=1e-10
+    )
 
 
 @pytest.mark.parametrize("move", [(0.0, 3.7), (1.3, -12.1)])
 def test_flow_is_the_same_everywhere(move) -> None:
-    """Moved by any vector, through the sheared boundary too, the same discs collide at the same times."""
+    """Moved by any vector, through the sheared boundary too, the same discs collide at the same
+    times.
+    """
     law, before = Law(0.5, 1e-3), lattice(10, 0.5, seed=1)
     _, sums = sheared(before, law, 0.4, blocks=2)
     _, moved = sheared(before._replace(positions=before.positions + move), law, 0.4, blocks=2)
@@ -60,7 +70,9 @@ def test_flow_is_the_same_everywhere(move) -> None:
 
 
 def test_elastic_gas_has_the_rate_and_pressure_of_enskog() -> None:
-    """ω = 2 n σ χ √(πT/m), p = nT (1 + 2νχ), with Henderson's χ, which is exact to 0.3 % at this packing fraction."""
+    """ω = 2 n σ χ √(πT/m), p = nT (1 + 2νχ), with Henderson's χ, which is exact to 0.3 % at this
+    packing fraction.
+    """
     fraction, count = 0.3, 400
     gas, _ = sheared(lattice(20, fraction, polydispersity=0.0), Law(1.0, shear_rate=0.0), 10.0)
     gas, sums = sheared(gas, Law(1.0, shear_rate=0.0), 80.0, blocks=16)
@@ -68,7 +80,11 @@ def test_elastic_gas_has_the_rate_and_pressure_of_enskog() -> None:
     np.testing.assert_allclose(found["granular_temperature"], 1, rtol=1e-9)
     chi, density = (1 - 7 * fraction / 16) / (1 - fraction) ** 2, 4 * fraction / np.pi
     expected = {
-        "collision_rate": 2 * density * chi * np.sqrt(np.pi) * np.sqrt(count / (count - 1)),  # without total momentum
+        "collision_rate": 2
+        * density
+        * chi
+        * np.sqrt(np.pi)
+        * np.sqrt(count / (count - 1)),  # without total momentum
         "pressure": density * (1 + 2 * fraction * chi),
     }
     for name, value in expected.items():

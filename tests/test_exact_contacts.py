@@ -1,4 +1,6 @@
-"""The reference of other tests: exact solutions agree with closed forms, and what is wrong is refused."""
+"""The reference of other tests: exact solutions agree with closed forms, and what is wrong is
+refused.
+"""
 
 import numpy as np
 import pytest
@@ -20,7 +22,9 @@ EPS = np.finfo(float).eps
 def problem(contacts, masses) -> tuple[np.ndarray, np.ndarray]:
     """G and u⁻ of the contacts in use."""
     used = np.asarray(contacts.used)
-    return incidence(contacts, len(masses))[used] / np.repeat(np.sqrt(masses), 2), np.asarray(contacts.approach)[used]
+    return incidence(contacts, len(masses))[used] / np.repeat(np.sqrt(masses), 2), np.asarray(
+        contacts.approach
+    )[used]
 
 
 def problem_of(network) -> tuple[np.ndarray, np.ndarray]:
@@ -41,20 +45,29 @@ jammed = pytest.mark.parametrize("network", JAMMED.values(), ids=JAMMED)
 
 @pytest.mark.parametrize("method", METHODS)
 def test_three_discs_in_a_row(method):
-    """One that hits two: at restitution zero all go on together; at one they leave as −1/3, 2/3, 2/3."""
+    """One that hits two: at restitution zero all go on together; at one they leave as −1/3, 2/3,
+    2/3.
+    """
     g, approach = problem_of(chain(3))
     changes = certified_impulses(g, approach, [method]) @ g
     np.testing.assert_allclose(np.array([1, 0, 0]) + changes[:6:2], 1 / 3, rtol=4 * EPS)
-    np.testing.assert_allclose(np.array([1, 0, 0]) + 2 * changes[:6:2], [-1 / 3, 2 / 3, 2 / 3], rtol=4 * EPS)
+    np.testing.assert_allclose(
+        np.array([1, 0, 0]) + 2 * changes[:6:2], [-1 / 3, 2 / 3, 2 / 3], rtol=4 * EPS
+    )
 
 
 @pytest.mark.parametrize("rings", [1, 2, 3])
 def test_pressed_hexagon_stops(rings):
-    """W is singular; the changes undo the compression, which moves every grain by its place from the centre."""
+    """W is singular; the changes undo the compression, which moves every grain by its place from
+    the centre.
+    """
     network = hexagonal(rings, struck=False)
     g, _ = problem_of(network)
     assert np.linalg.matrix_rank(g) < len(g)
-    a, b = (axis.ravel() for axis in np.meshgrid(np.arange(-rings, rings + 1), np.arange(-rings, rings + 1)))
+    a, b = (
+        axis.ravel()
+        for axis in np.meshgrid(np.arange(-rings, rings + 1), np.arange(-rings, rings + 1))
+    )
     places = np.stack([a + b / 2, b * np.sqrt(3) / 2], axis=-1)[np.abs(a + b) <= rings]
     found = exact(network.contacts, network.masses)
     assert found.feasible and found.residual < 1e-14
@@ -96,7 +109,12 @@ def test_no_impulses_stop_what_is_jammed(network):
     assert not exact(network.contacts, network.masses).feasible
     balanced = np.ones(len(g))  # both are pressed alike along every row of contacts
     assert is_obstacle(g, approach, balanced)
-    for wrong in (balanced + 1e-9 * np.eye(len(g))[0], -balanced, np.eye(len(g))[0], np.full(len(g), np.nan)):
+    for wrong in (
+        balanced + 1e-9 * np.eye(len(g))[0],
+        -balanced,
+        np.eye(len(g))[0],
+        np.full(len(g), np.nan),
+    ):
         assert not is_obstacle(g, approach, wrong)
     assert not is_obstacle(g, -approach, balanced)
     for size in 10.0 ** np.arange(0, 30, 3):  # what cancels in rounding is no solution either

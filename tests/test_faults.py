@@ -1,7 +1,8 @@
-"""Whatever happens to a map, nothing is lost, nothing is wrong, and what happened is said in a sentence.
+"""Whatever happens to a map, nothing is lost, nothing is wrong, and what happened is said in a
+sentence.
 
-Every test starts the real command line in a process of its own, and compares bit for bit with a map that nothing
-happened to.
+Every test starts the real command line in a process of its own, and compares bit for bit with a map
+that nothing happened to.
 """
 
 import os
@@ -20,7 +21,9 @@ from command_line import Outcome, assert_one_sentence, jaxgran
 
 from jaxgran.maps.results import open_map
 
-pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+pytestmark = pytest.mark.skipif(
+    not Path("/proc/self/stat").exists(), reason="looks for processes in /proc"
+)
 DRIVER = Path(__file__).with_name("fault_driver.py")
 FLOWS = ["--restitution", "0.3,0.7", "--packing-fraction", "0.6", "--grains", "32", "--seeds", "2"]
 STRAINS = ["--timestep", "1e-3", "--equilibrate", "3", "--strain", "10"]
@@ -49,7 +52,12 @@ class Lab:
         command = [sys.executable, str(DRIVER), *MAP, "--workers", "2", "--output", output, *words]
         environment = os.environ | {"FAULT": fault}
         environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # which JAX has set in this process
-        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+        streams = {
+            "stdout": subprocess.PIPE,
+            "stderr": subprocess.PIPE,
+            "text": True,
+            "start_new_session": True,
+        }
         return subprocess.Popen(command, cwd=self.folder, env=environment, **streams)
 
     def finish(self, process: subprocess.Popen) -> subprocess.CompletedProcess:
@@ -57,7 +65,9 @@ class Lab:
         assert "Traceback" not in err, err
         return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
-    def wait_for(self, output: str, pattern: str = "journal-*.nc", process: subprocess.Popen | None = None) -> None:
+    def wait_for(
+        self, output: str, pattern: str = "journal-*.nc", process: subprocess.Popen | None = None
+    ) -> None:
         """Wait until a file of the checkpoint is there."""
         folder, end = self.folder / f"{output}.unfinished", time.monotonic() + PATIENCE
         while not any(folder.glob(pattern)):
@@ -130,7 +140,9 @@ def test_a_map_that_is_interrupted_tells_the_command_that_continues_it(lab: Lab)
     lab.assert_whole_when_continued("interrupted.nc")
 
 
-def assert_tells_what_continues_it(done: subprocess.CompletedProcess, status: int, output: str) -> None:
+def assert_tells_what_continues_it(
+    done: subprocess.CompletedProcess, status: int, output: str
+) -> None:
     assert done.returncode == status
     *_, last = done.stderr.strip().splitlines()
     words = last.split("Continue: jaxgran ")[1].split()

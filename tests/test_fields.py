@@ -1,6 +1,7 @@
 """Fields obey the balance equations at every point, and stresses agree by every route.
 
-Derivatives by space and time are JAX's own, so that the laws hold to rounding. Points lie in many images of the cell.
+Derivatives by space and time are JAX's own, so that the laws hold to rounding. Points lie in many
+images of the cell.
 """
 
 from dataclasses import replace
@@ -26,7 +27,10 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
 KERNELS = {"gaussian": gaussian, "lucy": lucy}
-SMOOTH = {"gaussian": gaussian(0.25), "lucy": lucy(1.9)}  # e^-39 of the Gaussian is beyond half the side
+SMOOTH = {
+    "gaussian": gaussian(0.25),
+    "lucy": lucy(1.9),
+}  # e^-39 of the Gaussian is beyond half the side
 FLOW = ShearFlow(GRAINS, 0.3, 0.78, 1e-3)
 
 one_snapshot = jax.jit(partial(snapshot, solver=EXACT))
@@ -48,7 +52,9 @@ def seen(flowing, run) -> Snapshot:
 
 @pytest.fixture(scope="module")
 def points(seen) -> jax.Array:
-    """Some points in images of the cell near and far, among them a grain and the middle of a branch."""
+    """Some points in images of the cell near and far, among them a grain and the middle of a
+    branch.
+    """
     anywhere = np.random.default_rng(0).uniform(-2, 3, (38, 2)) * float(seen.state.side)
     contact = int(jnp.argmax(seen.impulses))
     centre = seen.state.positions[seen.contacts.j[contact]]
@@ -58,20 +64,25 @@ def points(seen) -> jax.Array:
 
 @jax.jit
 def plane_flux(seen: Snapshot, heights: jax.Array) -> jax.Array:
-    """Momentum (heights, 2) that crosses planes y = h upwards in the step of a snapshot, per length and time, in mγ̇².
+    """Momentum (heights, 2) that crosses planes y = h upwards in the step of a snapshot, per length
+    and time, in mγ̇².
 
-    Contacts whose branch crosses the plane transfer their impulse; grains that cross it in the flight carry their
-    momentum relative to the mean flow at the plane. The average over heights is the stress Σ^{yb}.
+    Contacts whose branch crosses the plane transfer their impulse; grains that cross it in the
+    flight carry their momentum relative to the mean flow at the plane. The average over heights is
+    the stress Σ^{yb}.
     """
     state, contacts = collided(seen), seen.contacts
     y, (cx, cy), area = state.positions[:, 1], state.velocities.T, state.side * seen.timestep
 
     def crossings(start, rise, height):
-        return jnp.floor((start + rise - height) / state.side) - jnp.floor((start - height) / state.side)
+        return jnp.floor((start + rise - height) / state.side) - jnp.floor(
+            (start - height) / state.side
+        )
 
     def through(height):
         crossing_impulses = (
-            crossings(y[contacts.j], contacts.normals[:, 1] * contacts.distances, height) * seen.impulses
+            crossings(y[contacts.j], contacts.normals[:, 1] * contacts.distances, height)
+            * seen.impulses
         )
         crossing_masses = crossings(y, seen.timestep * cy, height) * state.grains.masses
         above = y - height
@@ -84,7 +95,9 @@ def plane_flux(seen: Snapshot, heights: jax.Array) -> jax.Array:
 
 def densities(fields: Fields) -> jax.Array:
     """Mass, momentum and energy density, (points, 4)."""
-    return jnp.concatenate([fields.density[:, None], fields.momentum, fields.energy[:, None]], axis=1)
+    return jnp.concatenate(
+        [fields.density[:, None], fields.momentum, fields.energy[:, None]], axis=1
+    )
 
 
 def fluxes(fields: Fields) -> jax.Array:
@@ -94,14 +107,18 @@ def fluxes(fields: Fields) -> jax.Array:
 
 
 def outflow(fields_of, points: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Divergence (points, 4) of the fluxes of a function that gives fields at points, and the dissipation."""
+    """Divergence (points, 4) of the fluxes of a function that gives fields at points, and the
+    dissipation.
+    """
 
     def flux(points):
         fields = fields_of(points)
         return fluxes(fields), fields.dissipation
 
     units = jnp.zeros((2, *points.shape)).at[0, :, 0].set(1).at[1, :, 1].set(1)
-    slopes, loss = jax.vmap(lambda unit: jax.jvp(flux, (points,), (unit,), has_aux=True)[1:], out_axes=(0, None))(units)
+    slopes, loss = jax.vmap(
+        lambda unit: jax.jvp(flux, (points,), (unit,), has_aux=True)[1:], out_axes=(0, None)
+    )(units)
     return slopes[0, :, :, 0] + slopes[1, :, :, 1], loss
 
 
@@ -110,7 +127,9 @@ def flight_fields_at(state: State, points: jax.Array, graining: CoarseGraining) 
     index, zero = jnp.zeros(1, int), jnp.zeros(1)
     contacts = Contacts(index, index, jnp.zeros((1, 2)), zero, zero, zero, zero, index > 0)
     one = jnp.asarray(1.0)
-    return fields_at(Snapshot(state, contacts, zero, one, one, one, jnp.asarray(0)), points, graining)
+    return fields_at(
+        Snapshot(state, contacts, zero, one, one, one, jnp.asarray(0)), points, graining
+    )
 
 
 @jax.jit
@@ -122,7 +141,9 @@ def densities_of(state, points, graining):
 def rate_in_flight(state, points, graining):
     """∂/∂t of the densities in free flight."""
     now, unit = jnp.asarray(0.0), jnp.asarray(1.0)
-    return jax.jvp(lambda time: densities_of(flown(state, 1.0, time), points, graining), (now,), (unit,))[1]
+    return jax.jvp(
+        lambda time: densities_of(flown(state, 1.0, time), points, graining), (now,), (unit,)
+    )[1]
 
 
 @jax.jit
@@ -150,7 +171,9 @@ def test_coarse_graining_is_normalised_and_its_second_moment_known(name: str, wi
     r, weights = top * (nodes + 1) / 2, top * weights / 2
     values = np.asarray(graining.value(jnp.asarray(np.stack([0.6 * r, 0.8 * r], axis=1))))
     np.testing.assert_allclose(np.sum(weights * 2 * np.pi * r * values), 1, rtol=1e-13)
-    np.testing.assert_allclose(np.sum(weights * np.pi * r**3 * values), graining.second_moment, rtol=1e-13)
+    np.testing.assert_allclose(
+        np.sum(weights * np.pi * r**3 * values), graining.second_moment, rtol=1e-13
+    )
     beyond = graining.value(jnp.asarray([[graining.reach * 1.0001, 0.0]]))
     assert beyond[0] <= 1.6e-8 * graining.value(jnp.zeros((1, 2)))[0]
 
@@ -162,12 +185,16 @@ PROFILES = {
 
 
 def by_quadrature(name: str, width: float, middle, angle: float, length: float) -> float:
-    """The mean of G over a branch, cut where it enters the support and where it passes the centre."""
+    """The mean of G over a branch, cut where it enters the support and where it passes the
+    centre.
+    """
     normal = np.array([np.cos(angle), np.sin(angle)])
     middle = np.asarray(middle)
     nearest = middle @ normal
     half = np.sqrt(max(KERNELS[name](width).reach ** 2 - (middle @ middle - nearest**2), 0))
-    cuts = np.clip([-length / 2, nearest - half, nearest, nearest + half, length / 2], -length / 2, length / 2)
+    cuts = np.clip(
+        [-length / 2, nearest - half, nearest, nearest + half, length / 2], -length / 2, length / 2
+    )
 
     def along(t: float) -> float:
         return PROFILES[name](np.linalg.norm(middle - t * normal) / width) / width**2
@@ -206,17 +233,28 @@ def spread(graining, d):
     return graining.value(d[None])[0] + over[0]
 
 
-spread_backward, spread_forward = (jax.jit(slope(spread, argnums=(0, 1))) for slope in (jax.grad, jax.jacfwd))
+spread_backward, spread_forward = (
+    jax.jit(slope(spread, argnums=(0, 1))) for slope in (jax.grad, jax.jacfwd)
+)
 
 
 @smooth_kernels
-@pytest.mark.parametrize("middle", [(0.0, 0.0), (0.3, 0.0), (0.0, 1.9), (0.0, 1.9 - 1e-9), (0.2, 0.1)])
+@pytest.mark.parametrize(
+    "middle", [(0.0, 0.0), (0.3, 0.0), (0.0, 1.9), (0.0, 1.9 - 1e-9), (0.2, 0.1)]
+)
 def test_derivatives_exist_everywhere(name: str, middle) -> None:
     """At the centre, on the branch and at the edge of the support, in both modes."""
-    graining, d, h = replace(SMOOTH[name], width=jnp.asarray(SMOOTH[name].width)), jnp.asarray(middle), 1e-5
+    graining, d, h = (
+        replace(SMOOTH[name], width=jnp.asarray(SMOOTH[name].width)),
+        jnp.asarray(middle),
+        1e-5,
+    )
 
     def difference(wider: float, step: jax.Array) -> jax.Array:
-        above, below = (spread(replace(graining, width=graining.width + s * wider), d + s * step) for s in (1, -1))
+        above, below = (
+            spread(replace(graining, width=graining.width + s * wider), d + s * step)
+            for s in (1, -1)
+        )
         return (above - below) / (2 * h)
 
     x, y = h * jnp.eye(2)
@@ -227,7 +265,9 @@ def test_derivatives_exist_everywhere(name: str, middle) -> None:
 
 
 @smooth_kernels
-def test_mass_momentum_and_energy_are_balanced_in_flight_at_every_point(seen, points, name: str) -> None:
+def test_mass_momentum_and_energy_are_balanced_in_flight_at_every_point(
+    seen, points, name: str
+) -> None:
     """∂ρ/∂t = −∇·(ρV), ∂(ρV)/∂t = −∇·(ρVV + Σ_k), ∂(ρe)/∂t = −∇·(ρeV + Σ_k·V + J_Q)."""
     flying, graining = collided(seen), SMOOTH[name]
     rate, diverging = (of(flying, points, graining) for of in (rate_in_flight, outflow_in_flight))
@@ -236,10 +276,14 @@ def test_mass_momentum_and_energy_are_balanced_in_flight_at_every_point(seen, po
 
 
 @smooth_kernels
-def test_collisions_hand_over_momentum_and_energy_along_their_branches(seen, points, name: str) -> None:
+def test_collisions_hand_over_momentum_and_energy_along_their_branches(
+    seen, points, name: str
+) -> None:
     """ρV changes by −dt ∇·Σ_s, and ρe by −dt (∇·(Σ_s·V + J_Q) + ζ); ρ stays."""
     after, graining = collided(seen), SMOOTH[name]
-    rate = (densities_of(after, points, graining) - densities_of(seen.state, points, graining)) / seen.timestep
+    rate = (
+        densities_of(after, points, graining) - densities_of(seen.state, points, graining)
+    ) / seen.timestep
     diverging, loss = outflow_of_step(seen, points, graining)
     diverging = diverging - outflow_in_flight(after, points, graining)
     np.testing.assert_allclose(rate[:, 0], 0, atol=0)
@@ -249,16 +293,25 @@ def test_collisions_hand_over_momentum_and_energy_along_their_branches(seen, poi
     assert_balanced(rate[:, 3], diverging[:, 3], loss)
 
 
-def test_a_step_of_the_engine_is_balanced_to_the_order_of_its_flight(flowing, run, seen, points) -> None:
-    """With the fields of the snapshot to first order in dt; with the carried fluxes of mid-flight to second order."""
+def test_a_step_of_the_engine_is_balanced_to_the_order_of_its_flight(
+    flowing, run, seen, points
+) -> None:
+    """With the fields of the snapshot to first order in dt; with the carried fluxes of mid-flight
+    to second order.
+    """
     graining, residuals = SMOOTH["gaussian"], []
     for timestep in (1e-3, 5e-4, 2.5e-4):
         flow = replace(FLOW, timestep=timestep)
         now = one_snapshot(flow, seen.state)
         assert jnp.sum(now.impulses > 0) >= 1  # an overlap stays one
-        begin, end = (densities_of(x, points, graining) for x in (seen.state, run(flow, seen.state, 1)[0]))
+        begin, end = (
+            densities_of(x, points, graining) for x in (seen.state, run(flow, seen.state, 1)[0])
+        )
         diverging, loss = outflow_of_step(now, points, graining)
-        begun, halfway = (outflow_in_flight(flown(collided(now), 1.0, t), points, graining) for t in (0, timestep / 2))
+        begun, halfway = (
+            outflow_in_flight(flown(collided(now), 1.0, t), points, graining)
+            for t in (0, timestep / 2)
+        )
         first = (end - begin) / timestep + diverging + loss[:, None] * jnp.asarray([[0, 0, 0, 1.0]])
         residuals.append([np.max(np.abs(x), axis=0) for x in (first, first + halfway - begun)])
     orders = -np.diff(np.log2(residuals), axis=0)
@@ -268,19 +321,27 @@ def test_a_step_of_the_engine_is_balanced_to_the_order_of_its_flight(flowing, ru
 
 @smooth_kernels
 def test_averages_over_the_cell_are_the_virial_sums(seen, name: str) -> None:
-    """<Σ_s> = (1/A) Σ σF; <Σ_k + ρ(V − γ̇y)²> = (1/A) Σ m c c + γ̇² w₂ (1/A) Σ m x̂x̂, w₂ the second moment of G.
+    """<Σ_s> = (1/A) Σ σF; <Σ_k + ρ(V − γ̇y)²> = (1/A) Σ m c c + γ̇² w₂ (1/A) Σ m x̂x̂, w₂ the
+    second moment of G.
 
     An image at the height d above the point is slower by γ̇d than its peculiar velocity says.
     """
-    graining, area = {"gaussian": gaussian(0.3), "lucy": lucy(2.0)}[name], float(seen.state.side) ** 2
+    graining, area = (
+        {"gaussian": gaussian(0.3), "lucy": lucy(2.0)}[name],
+        float(seen.state.side) ** 2,
+    )
     count, tolerance = (64, 1e-7) if name == "gaussian" else (96, 1e-6)
     points = grid(seen.state.side, count)
     fields = fields_at(seen, points, graining)
     mean = partial(np.mean, axis=0)
     contacts, force = seen.contacts, np.asarray(seen.impulses / seen.timestep)
     normals = np.asarray(contacts.normals)
-    virial = np.einsum("c,ca,cb->ab", force * np.asarray(contacts.distances), normals, normals) / area
-    np.testing.assert_allclose(mean(fields.contact_stress), virial, rtol=0, atol=tolerance * np.max(np.abs(virial)))
+    virial = (
+        np.einsum("c,ca,cb->ab", force * np.asarray(contacts.distances), normals, normals) / area
+    )
+    np.testing.assert_allclose(
+        mean(fields.contact_stress), virial, rtol=0, atol=tolerance * np.max(np.abs(virial))
+    )
 
     masses, c = np.asarray(seen.state.grains.masses), np.asarray(collided(seen).velocities)
     moment = np.einsum("i,ia,ib->ab", masses, c, c) / area
@@ -288,17 +349,25 @@ def test_averages_over_the_cell_are_the_virial_sums(seen, name: str) -> None:
     apart = np.array(fields.velocity)
     apart[:, 0] -= np.asarray(points)[:, 1]
     flow = np.asarray(fields.density)[:, None, None] * apart[:, :, None] * apart[:, None, :]
-    np.testing.assert_allclose(mean(fields.kinetic_stress + flow), moment, rtol=0, atol=tolerance * np.max(moment))
+    np.testing.assert_allclose(
+        mean(fields.kinetic_stress + flow), moment, rtol=0, atol=tolerance * np.max(moment)
+    )
     np.testing.assert_allclose(mean(fields.density), np.sum(masses) / area, rtol=tolerance)
     np.testing.assert_allclose(mean(fields.number_density), GRAINS / area, rtol=tolerance)
     loss = np.sum(masses[:, None] * (np.asarray(seen.state.velocities) ** 2 - c**2)) / 2
-    loss -= float(seen.timestep) * virial[0, 1] * area  # the shear works on the contact stress while they touch
-    np.testing.assert_allclose(mean(fields.dissipation), loss / (area * float(seen.timestep)), rtol=1e-5)
+    loss -= (
+        float(seen.timestep) * virial[0, 1] * area
+    )  # the shear works on the contact stress while they touch
+    np.testing.assert_allclose(
+        mean(fields.dissipation), loss / (area * float(seen.timestep)), rtol=1e-5
+    )
 
 
 @every_kernel
 def test_fields_are_those_of_every_image(seen, points, name: str) -> None:
-    """At r + lattice vector the velocity has γ̇L more for every row; wrapping or moving grains to images is nothing."""
+    """At r + lattice vector the velocity has γ̇L more for every row; wrapping or moving grains to
+    images is nothing.
+    """
     graining, side, tilt = KERNELS[name](0.3), seen.state.side, seen.state.tilt
     here = fields_at(seen, points, graining)
     for columns, rows in ((1, 0), (0, 1), (-3, 2)):
@@ -307,8 +376,14 @@ def test_fields_are_those_of_every_image(seen, points, name: str) -> None:
         moved = there.velocity - jnp.stack([rows * side, jnp.zeros(())])[None]
         assert_same(replace(there, velocity=moved), here, 1e-9)
     vectors = np.random.default_rng(1).integers(-2, 3, (GRAINS, 2)).astype(float)
-    elsewhere = seen.state.positions + side * jnp.stack([vectors[:, 0] + tilt * vectors[:, 1], vectors[:, 1]], axis=1)
-    assert_same(fields_at(replace(seen, state=replace(seen.state, positions=elsewhere)), points, graining), here, 1e-9)
+    elsewhere = seen.state.positions + side * jnp.stack(
+        [vectors[:, 0] + tilt * vectors[:, 1], vectors[:, 1]], axis=1
+    )
+    assert_same(
+        fields_at(replace(seen, state=replace(seen.state, positions=elsewhere)), points, graining),
+        here,
+        1e-9,
+    )
     offset = jnp.asarray([[0.37, -1.21]])
     moved = replace(seen.state, positions=wrap(seen.state.positions + offset, side, tilt))
     there = fields_at(replace(seen, state=moved), points + offset, graining)
@@ -333,8 +408,12 @@ def test_two_discs_that_collide_have_known_fields(scene) -> None:
     np.testing.assert_allclose(fields.density, 2 * g)
     np.testing.assert_allclose(fields.number_density, 2 * g)
     np.testing.assert_allclose(fields.velocity[0], [3.0, 2.0], rtol=1e-10)
-    np.testing.assert_allclose(fields.contact_stress[0], impulse / 1e-3 * line * xx, rtol=1e-10, atol=1e-9)
-    np.testing.assert_allclose(fields.kinetic_stress[0], 2 * g * 0.5**2 * xx, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(
+        fields.contact_stress[0], impulse / 1e-3 * line * xx, rtol=1e-10, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        fields.kinetic_stress[0], 2 * g * 0.5**2 * xx, rtol=1e-10, atol=1e-10
+    )
     np.testing.assert_allclose(fields.temperature, 0.5**2 / 2, rtol=1e-10)
     np.testing.assert_allclose(fields.dissipation, loss / 1e-3 * g, rtol=1e-10)
     np.testing.assert_allclose(fields.heat_flux, 0, atol=1e-9)
@@ -342,21 +421,30 @@ def test_two_discs_that_collide_have_known_fields(scene) -> None:
 
 
 def virial_stress(seen: Snapshot) -> np.ndarray:
-    """Σ^{yb} of a step: of the contacts, and of the grains on average over their flight, where c_x falls by γ̇ c_y t."""
+    """Σ^{yb} of a step: of the contacts, and of the grains on average over their flight, where c_x
+    falls by γ̇ c_y t.
+    """
     area, dt = float(seen.state.side) ** 2, float(seen.timestep)
-    normals, pushed = np.asarray(seen.contacts.normals), np.asarray(seen.impulses * seen.contacts.distances) / dt
+    normals, pushed = (
+        np.asarray(seen.contacts.normals),
+        np.asarray(seen.impulses * seen.contacts.distances) / dt,
+    )
     masses, c = np.asarray(seen.state.grains.masses), np.array(collided(seen).velocities)
     c[:, 0] -= c[:, 1] * dt / 2
     return ((pushed * normals[:, 1]) @ normals + (masses * c[:, 1]) @ c) / area
 
 
 def test_momentum_through_planes_of_all_heights_is_the_virial_stress(seen) -> None:
-    """The flux is linear in the height between the heights at which a branch or a flight begins or ends."""
+    """The flux is linear in the height between the heights at which a branch or a flight begins or
+    ends.
+    """
     side, y = float(seen.state.side), np.asarray(seen.state.positions)[:, 1]
     start = y[np.asarray(seen.contacts.j)]
     rise = np.asarray(seen.contacts.normals)[:, 1] * np.asarray(seen.contacts.distances)
     flight = float(seen.timestep) * np.asarray(collided(seen).velocities)[:, 1]
-    edges = np.unique(np.concatenate([[0, side], *(x % side for x in (start, start + rise, y, y + flight))]))
+    edges = np.unique(
+        np.concatenate([[0, side], *(x % side for x in (start, start + rise, y, y + flight))])
+    )
     flux = plane_flux(seen, jnp.asarray((edges[1:] + edges[:-1]) / 2))
     mean = np.diff(edges) @ np.asarray(flux) / side
     np.testing.assert_allclose(mean, virial_stress(seen), rtol=0, atol=1e-10 * np.max(np.abs(mean)))

@@ -13,7 +13,9 @@ from matplotlib.text import Text
 
 from jaxgran.plotting.map_figures import FIGURES
 
-GAP = np.array([1.0, -1.0])  # points between texts, beside and above each other: boxes are higher than their letters
+GAP = np.array(
+    [1.0, -1.0]
+)  # points between texts, beside and above each other: boxes are higher than their letters
 
 
 def with_faults(data: xr.Dataset) -> xr.Dataset:
@@ -21,12 +23,18 @@ def with_faults(data: xr.Dataset) -> xr.Dataset:
     data = data.copy(deep=True)
     for k in range(1, 7):
         data.status[k % data.sizes["packing_fraction"], k % data.sizes["restitution"]] = k
-    return data.assign({name: data[name].where(data.status < 5) for name in data if name != "status"})
+    return data.assign(
+        {name: data[name].where(data.status < 5) for name in data if name != "status"}
+    )
 
 
 def with_errors(data: xr.Dataset, share: float) -> xr.Dataset:
     """The map with standard errors that are this share of its excess and its averages."""
-    stderrs = {name: share * abs(data[name.removesuffix("_stderr")]) for name in map(str, data) if "_stderr" in name}
+    stderrs = {
+        name: share * abs(data[name.removesuffix("_stderr")])
+        for name in map(str, data)
+        if "_stderr" in name
+    }
     return data.assign(stderrs | {"force_ratio_stderr": share * (data.force_ratio - 1.0)})
 
 
@@ -40,7 +48,9 @@ MAPS = {
 
 
 def drawn_texts(figure: Figure) -> dict[Text, Path]:
-    """The texts that are drawn, each with the rectangle around it, turned as the text is, in pixels."""
+    """The texts that are drawn, each with the rectangle around it, turned as the text is, in
+    pixels.
+    """
     texts: list[Text] = []
 
     def note(self: Text, renderer: RendererBase) -> None:
@@ -54,14 +64,18 @@ def drawn_texts(figure: Figure) -> dict[Text, Path]:
 
 
 def box_of(text: Text) -> Path:
-    """The corners of the rectangle around a text: that of the upright text, turned about its centre."""
+    """The corners of the rectangle around a text: that of the upright text, turned about its
+    centre.
+    """
     around, angle = text.get_window_extent(), np.radians(text.get_rotation())
     turned = text.get_transform_rotates_text()
     text.set(rotation=0, transform_rotates_text=False)
     size = np.array(text.get_window_extent().size)
     text.set(rotation=np.degrees(angle), transform_rotates_text=turned)
     middle = np.array([around.x0 + around.x1, around.y0 + around.y1]) / 2
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2 * (size + GAP * text.figure.dpi / 72)
+    corners = (
+        np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2 * (size + GAP * text.figure.dpi / 72)
+    )
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     return Path([*(middle + corners @ turn), middle], closed=True)
 
@@ -72,7 +86,9 @@ def unreadable(figure: Figure) -> list[str]:
     problems = [
         f"{text.get_text()!r} leaves the canvas"
         for text in boxes
-        if not ((text.get_window_extent().min >= 0) & (text.get_window_extent().max <= (width, height))).all()
+        if not (
+            (text.get_window_extent().min >= 0) & (text.get_window_extent().max <= (width, height))
+        ).all()
     ]
     return problems + [
         f"{one.get_text()!r} on {other.get_text()!r}"

@@ -1,4 +1,6 @@
-"""The figures show the map: contours where the excess has its level, error bars, marks, and whole files."""
+"""The figures show the map: contours where the excess has its level, error bars, marks, and whole
+files.
+"""
 
 from pathlib import Path
 
@@ -14,7 +16,12 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from jaxgran.plotting.map_figures import save_figures
-from jaxgran.plotting.ratio import EXCESS_LEVELS, ratio_against_timestep, ratio_contours, ratio_curves
+from jaxgran.plotting.ratio import (
+    EXCESS_LEVELS,
+    ratio_against_timestep,
+    ratio_contours,
+    ratio_curves,
+)
 
 
 def lines_of_contours(figure: Figure) -> dict[float, np.ndarray]:
@@ -35,7 +42,9 @@ def error_bars(figure: Figure, panel: int = 0) -> list[np.ndarray]:
 
 
 def with_stress_ratio(data: xr.Dataset) -> xr.Dataset:
-    """Return the map with a ratio of the stresses whose excess is twice that of the force ratio in component xy."""
+    """Return the map with a ratio of the stresses whose excess is twice that of the force ratio in
+    component xy.
+    """
     factors = xr.DataArray([[1.0, 2.0], [2.0, 1.0]], dims=("axis_a", "axis_b"))
     ratio, error = 1.0 + (data.force_ratio - 1.0) * factors, data.force_ratio_stderr * factors
     return data.assign(stress_ratio=ratio, stress_ratio_stderr=error)
@@ -69,7 +78,10 @@ def test_error_bars_have_the_length_of_the_standard_error() -> None:
     assert len(bars) == data.sizes["restitution"]
     for alpha, ends in zip(data.restitution, bars, strict=True):
         curve = data.sel(restitution=alpha)
-        expected = curve.force_ratio.values[:, None] + curve.force_ratio_stderr.values[:, None] * [-1.0, 1.0]
+        expected = curve.force_ratio.values[:, None] + curve.force_ratio_stderr.values[:, None] * [
+            -1.0,
+            1.0,
+        ]
         np.testing.assert_allclose(ends, expected, rtol=1e-12)
 
 
@@ -78,14 +90,21 @@ def test_curves_of_the_shear_stress_ratio_have_a_panel_on_the_scale_of_the_force
     figure = ratio_curves(data.transpose(..., "restitution", "packing_fraction"))
     assert figure.axes[0].get_ylim() == figure.axes[1].get_ylim()
     for k, ends in enumerate(error_bars(figure, panel=1)):
-        shear, error = data.stress_ratio[:, k, 0, 1].values, data.stress_ratio_stderr[:, k, 0, 1].values
+        shear, error = (
+            data.stress_ratio[:, k, 0, 1].values,
+            data.stress_ratio_stderr[:, k, 0, 1].values,
+        )
         np.testing.assert_allclose(ends, shear[:, None] + error[:, None] * [-1.0, 1.0], rtol=1e-12)
 
 
 def test_every_point_is_a_curve_against_the_time_step_with_its_errors() -> None:
     data = with_timesteps(ratio_dataset(3, 3), 1e-3, 1e-4, 1e-5)
-    curves = [container for axes in ratio_against_timestep(data).axes for container in axes.containers]
-    points = [(nu, alpha) for nu in data.packing_fraction.values for alpha in data.restitution.values]
+    curves = [
+        container for axes in ratio_against_timestep(data).axes for container in axes.containers
+    ]
+    points = [
+        (nu, alpha) for nu in data.packing_fraction.values for alpha in data.restitution.values
+    ]
     for container, (nu, alpha) in zip(curves, points, strict=True):
         point = data.sel(packing_fraction=nu, restitution=alpha).sortby("timestep")
         expected = np.stack([point.timestep, point.force_ratio], -1)
@@ -94,16 +113,28 @@ def test_every_point_is_a_curve_against_the_time_step_with_its_errors() -> None:
         np.testing.assert_allclose(np.diff(ends)[:, 0], 2.0 * point.force_ratio_stderr, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("format", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
-def test_the_same_map_gives_the_same_bytes_in_every_format(format, start: bytes, tmp_path: Path) -> None:
-    files = [save_figures(ratio_dataset(1, 2), tmp_path / name, format, dpi=50)[0] for name in ("first", "second")]
-    assert [path.name for path in files] == [f"{name}_curves.{format}" for name in ("first", "second")]
+@pytest.mark.parametrize(
+    ("format", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")]
+)
+def test_the_same_map_gives_the_same_bytes_in_every_format(
+    format, start: bytes, tmp_path: Path
+) -> None:
+    files = [
+        save_figures(ratio_dataset(1, 2), tmp_path / name, format, dpi=50)[0]
+        for name in ("first", "second")
+    ]
+    assert [path.name for path in files] == [
+        f"{name}_curves.{format}" for name in ("first", "second")
+    ]
     first, second = (path.read_bytes() for path in files)
     assert first.startswith(start) and first == second
 
 
 def test_a_picture_has_the_resolution_asked_for(tmp_path: Path) -> None:
-    sizes = [imread(save_figures(ratio_dataset(1), tmp_path / "map", dpi=dpi)[0]).shape[:2] for dpi in (100, 50)]
+    sizes = [
+        imread(save_figures(ratio_dataset(1), tmp_path / "map", dpi=dpi)[0]).shape[:2]
+        for dpi in (100, 50)
+    ]
     np.testing.assert_allclose(sizes[0], 2 * np.array(sizes[1]), atol=1)
 
 
@@ -117,7 +148,9 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(Figure, "savefig", broken)
     with pytest.raises(OSError, match="disc full"):
         save_figures(ratio_dataset(), tmp_path / "map")
-    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("map_curves.png", "old")]
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [
+        ("map_curves.png", "old")
+    ]
 
 
 def test_global_plotting_state_is_untouched(tmp_path: Path) -> None:

@@ -1,4 +1,6 @@
-"""A restitution is found from states at both ends of short windows, and longer windows are refused."""
+"""A restitution is found from states at both ends of short windows, and longer windows are
+refused.
+"""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -28,7 +30,10 @@ def starts() -> jg.State:
 
 def noisy(state: jg.State, seed: int) -> jg.State:
     rng, shape = np.random.default_rng(seed), state.positions.shape
-    positions, velocities = state.positions + POSITION * rng.normal(size=shape), VELOCITY * rng.normal(size=shape)
+    positions, velocities = (
+        state.positions + POSITION * rng.normal(size=shape),
+        VELOCITY * rng.normal(size=shape),
+    )
     return replace(state, positions=positions, velocities=state.velocities + velocities)
 
 
@@ -38,7 +43,9 @@ def fit(seed: int, steps: int = STEPS, **options) -> tuple[TrajectoryFit, jg.Sta
     seen = noisy(start, 10 + seed) if "velocities" in options else start
     options = {"events": 60, **options}  # compiled for all seeds
     flow = replace(FLOW, restitution=GUESS)
-    return jg.fit_trajectory(flow, seen, noisy(end, seed), steps, POSITION, VELOCITY, **options), start
+    return jg.fit_trajectory(
+        flow, seen, noisy(end, seed), steps, POSITION, VELOCITY, **options
+    ), start
 
 
 def test_restitution_is_found_within_its_error_bar() -> None:
@@ -52,7 +59,9 @@ def test_restitution_is_found_within_its_error_bar() -> None:
 
 
 def test_states_at_the_start_are_found_better_than_they_were_seen_or_the_fit_is_refused() -> None:
-    """Noise at the start may lead to other collisions, at which the misfit stays above what noise explains."""
+    """Noise at the start may lead to other collisions, at which the misfit stays above what noise
+    explains.
+    """
     found = {}
     for seed in range(4):
         with suppress(jg.InputError):

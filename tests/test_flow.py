@@ -44,7 +44,11 @@ def test_one_bad_replica_refuses_the_batch(array):
 )
 def test_every_value_of_the_ranges_is_accepted(grains, restitution, packing_fraction, timestep):
     flow = ShearFlow(grains, restitution, packing_fraction, timestep)
-    assert (flow.restitution, flow.packing_fraction, flow.timestep) == (restitution, packing_fraction, timestep)
+    assert (flow.restitution, flow.packing_fraction, flow.timestep) == (
+        restitution,
+        packing_fraction,
+        timestep,
+    )
 
 
 def test_a_flow_may_be_without_shear():
@@ -65,7 +69,9 @@ def test_flow_is_a_pytree_of_its_numbers():
 
 
 def test_batch_of_flows_is_a_flow_of_arrays():
-    batch = replace(FLOW, restitution=np.array([0.1, 0.5, 0.9]), timestep=jnp.array([1e-3, 1e-4, 1e-5]))
+    batch = replace(
+        FLOW, restitution=np.array([0.1, 0.5, 0.9]), timestep=jnp.array([1e-3, 1e-4, 1e-5])
+    )
     axes = jax.tree.map(lambda values: 0 if np.ndim(values) else None, batch)
     products = jax.vmap(lambda flow: flow.restitution * flow.timestep, in_axes=(axes,))(batch)
     np.testing.assert_array_equal(products, batch.restitution * np.asarray(batch.timestep))
@@ -87,7 +93,9 @@ def test_traced_numbers_are_not_judged():
     st.sampled_from([np.float32, np.float64]),
 )
 @settings(max_examples=50)
-def test_time_steps_of_a_strain_are_the_same_bits_traced_or_not(dt: float, rate: float, strain: float, kind) -> None:
+def test_time_steps_of_a_strain_are_the_same_bits_traced_or_not(
+    dt: float, rate: float, strain: float, kind
+) -> None:
     numbers = [kind(x) for x in (strain, rate, dt / rate)]
 
     def steps(strain, rate, dt):

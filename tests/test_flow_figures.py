@@ -1,4 +1,6 @@
-"""Pictures of a flow show its grains, its forces and its cell; movies are whole, and their frames differ."""
+"""Pictures of a flow show its grains, its forces and its cell; movies are whole, and their frames
+differ.
+"""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -22,36 +24,57 @@ from jaxgran.plotting.movie import Frames, check_movie, write_movie
 SIDE, GRAINS = 8.0, 40
 
 
-def seen(tilt: float = 0.0, times: int = 1, contacts=((0, 1, 2.0), (1, 2, 1.0), (3, 4, 0.5)), seed: int = 0, **more):
+def seen(
+    tilt: float = 0.0,
+    times: int = 1,
+    contacts=((0, 1, 2.0), (1, 2, 1.0), (3, 4, 0.5)),
+    seed: int = 0,
+    **more,
+):
     """A snapshot: a cluster of three, and a binary collision."""
     random = np.random.default_rng(seed)
     positions = random.uniform(0, SIDE, (1, GRAINS, 2)).repeat(times, axis=0)
     velocities = random.normal(size=(1, GRAINS, 2)).repeat(times, axis=0)
-    return snapshot_of(positions, [list(contacts)] * times, velocities, side=SIDE, tilt=tilt, **more)
+    return snapshot_of(
+        positions, [list(contacts)] * times, velocities, side=SIDE, tilt=tilt, **more
+    )
 
 
 def drawn(scene, scale: Scale | None = None):
     axes = empty_figure(4, 4).subplots()
     draw_scene(axes, scene, "speed", scale or common_scale([scene], "speed"))
     (grains,) = (artist for artist in axes.collections if isinstance(artist, EllipseCollection))
-    clusters, binaries = (artist for artist in axes.collections if isinstance(artist, LineCollection))
+    clusters, binaries = (
+        artist for artist in axes.collections if isinstance(artist, LineCollection)
+    )
     (cell,) = (artist for artist in axes.patches if isinstance(artist, Polygon))
     return grains, clusters, binaries, cell
 
 
 def area_within(grains: EllipseCollection, cell: Polygon, points: int = 400) -> float:
-    """Share of the cell that is covered, where grains do not overlap the sum over them of the area inside."""
+    """Share of the cell that is covered, where grains do not overlap the sum over them of the area
+    inside.
+    """
     corners = cell.get_xy()[:-1]
     u = (np.arange(points) + 0.5) / points
-    mesh = corners[0] + u[:, None, None] * (corners[1] - corners[0]) + u[:, None] * (corners[3] - corners[0])
+    mesh = (
+        corners[0]
+        + u[:, None, None] * (corners[1] - corners[0])
+        + u[:, None] * (corners[3] - corners[0])
+    )
     centres, radii = grains.get_offsets(), grains.get_widths() / 2
-    inside = [np.sum((mesh - centre) ** 2, axis=-1) < radius**2 for centre, radius in zip(centres, radii, strict=True)]
+    inside = [
+        np.sum((mesh - centre) ** 2, axis=-1) < radius**2
+        for centre, radius in zip(centres, radii, strict=True)
+    ]
     return float(np.mean(np.sum(inside, axis=0)))
 
 
 @pytest.mark.parametrize("tilt", [-0.5, 0.0, 0.2])
 def test_grains_cut_at_the_edges_and_their_images_make_whole_grains(tilt: float) -> None:
-    """The parts of the images within the cell sum up to the area of all grains: none is missing, none twice there."""
+    """The parts of the images within the cell sum up to the area of all grains: none is missing,
+    none twice there.
+    """
     scene = scene_of(seen(tilt))
     grains, *_, cell = drawn(scene)
     assert area_within(grains, cell) == pytest.approx(GRAINS * np.pi / 4 / SIDE**2, rel=2e-3)
@@ -64,7 +87,9 @@ def test_lines_join_the_centres_of_grains_that_push_in_widths_by_their_forces() 
     assert max(widths) == flow.WIDEST_LINE
     np.testing.assert_allclose(sorted(widths), flow.WIDEST_LINE * np.array([0.25, 0.5, 1.0]))
     start, end = (scene.instant.positions[k] for k in (4, 3))
-    (middle,) = (line for line in binaries.get_segments() if np.allclose(line[0], start))  # the image not shifted
+    (middle,) = (
+        line for line in binaries.get_segments() if np.allclose(line[0], start)
+    )  # the image not shifted
     lattice = np.linalg.solve(np.array([[SIDE, 0.2 * SIDE], [0, SIDE]]), middle[1] - end)
     np.testing.assert_allclose(lattice, np.round(lattice), atol=1e-9)
     assert np.linalg.norm(middle[1] - middle[0]) < SIDE
@@ -87,7 +112,9 @@ def test_pressures_of_grains_of_one_size_sum_up_to_the_contact_stress() -> None:
     positions[0, :, 0] = np.arange(GRAINS) % 8 * 1.0
     positions[0, :, 1] = np.arange(GRAINS) // 8 * 1.5
     scene = scene_of(snapshot_of(positions, [[(0, 1, 2.0), (2, 1, 3.0)]], side=SIDE))
-    assert np.sum(np.pi * scene.instant.radii**2 * scene.pressure) == pytest.approx((2.0 + 3.0) * 1.0 / 2)
+    assert np.sum(np.pi * scene.instant.radii**2 * scene.pressure) == pytest.approx(
+        (2.0 + 3.0) * 1.0 / 2
+    )
 
 
 def test_forces_of_a_series_are_means_over_its_times() -> None:

@@ -1,4 +1,6 @@
-"""Derivatives of a contact solve and of a run, against finite differences and against laws that are known."""
+"""Derivatives of a contact solve and of a run, against finite differences and against laws that are
+known.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -30,8 +32,12 @@ STEPS = 40
 
 @jax.jit
 def impulses_of(approach, angles, inverse_masses, network: Contacts):
-    """Impulses of a network with given approach velocities, directions of the normals and inverse masses of grains."""
-    normals = jnp.where(network.used[:, None], jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1), 0)
+    """Impulses of a network with given approach velocities, directions of the normals and inverse
+    masses of grains.
+    """
+    normals = jnp.where(
+        network.used[:, None], jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1), 0
+    )
     turned = replace(
         network,
         approach=approach,
@@ -39,7 +45,9 @@ def impulses_of(approach, angles, inverse_masses, network: Contacts):
         inverse_mass_i=jnp.where(network.used, inverse_masses[network.i], 0),
         inverse_mass_j=jnp.where(network.used, inverse_masses[network.j], 0),
     )
-    return solve(turned, MAX_DISCS, jnp.asarray(1.0), BarzilaiBorwein(1e-12, 100_000), jnp.asarray(True)).impulses
+    return solve(
+        turned, MAX_DISCS, jnp.asarray(1.0), BarzilaiBorwein(1e-12, 100_000), jnp.asarray(True)
+    ).impulses
 
 
 @jax.jit
@@ -60,14 +68,18 @@ def strictness(network: Contacts, masses: np.ndarray) -> float:
     """How far the network is from a contact that neither presses nor parts."""
     impulses = np.asarray(impulses_of(*inputs(network, masses), network))
     matrix = delassus(network, masses)
-    margin = np.maximum(np.diag(matrix) * impulses, matrix @ impulses + np.asarray(network.approach))
+    margin = np.maximum(
+        np.diag(matrix) * impulses, matrix @ impulses + np.asarray(network.approach)
+    )
     return float(np.min(margin[np.asarray(network.used)]))
 
 
 @settings(max_examples=25, phases=[Phase.generate])
 @given(networks, st.sampled_from([1.0, 100.0]))
 def test_gradient_of_a_solve_is_that_of_finite_differences(network_of, heaviest):
-    """With respect to velocities, geometry and masses, wherever no contact is about to press or to part."""
+    """With respect to velocities, geometry and masses, wherever no contact is about to press or to
+    part.
+    """
     network, masses, _ = random_network(*network_of, heaviest)
     assume(np.any(network.used) and strictness(network, masses) > 1e-3)
     used = np.asarray(network.used)
@@ -78,11 +90,19 @@ def test_gradient_of_a_solve_is_that_of_finite_differences(network_of, heaviest)
     assume(float(jnp.max(jnp.abs(derivative[0]))) < 1e3)  # else differences lose their digits
     for k in range(3):
         real = used if k < 2 else np.ones(MAX_DISCS)
-        along = tuple(jnp.asarray(real * rng.normal(size=x.shape) if n == k else 0 * x) for n, x in enumerate(at))
+        along = tuple(
+            jnp.asarray(real * rng.normal(size=x.shape) if n == k else 0 * x)
+            for n, x in enumerate(at)
+        )
 
         def difference(step: float, along=along) -> float:
-            moved = [tuple(x + sign * step * d for x, d in zip(at, along, strict=True)) for sign in (1, -1)]
-            return float(weighted(*moved[0], network, weights) - weighted(*moved[1], network, weights)) / (2 * step)
+            moved = [
+                tuple(x + sign * step * d for x, d in zip(at, along, strict=True))
+                for sign in (1, -1)
+            ]
+            return float(
+                weighted(*moved[0], network, weights) - weighted(*moved[1], network, weights)
+            ) / (2 * step)
 
         numerical = (4 * difference(1e-5) - difference(2e-5)) / 3  # of fourth order
         exact = float(jnp.sum(derivative[k] * along[k]))
@@ -92,9 +112,13 @@ def test_gradient_of_a_solve_is_that_of_finite_differences(network_of, heaviest)
 
 
 def test_velocities_are_differentiable_where_impulses_are_not_unique():
-    """A disc that hits a rigid hexagon of seven, which has one contact more than it takes to hold it together."""
+    """A disc that hits a rigid hexagon of seven, which has one contact more than it takes to hold
+    it together.
+    """
     angles = np.arange(6) * np.pi / 3
-    places = np.concatenate([[[0.0, 0.0]], np.stack([np.cos(angles), np.sin(angles)], -1), [[2.0, 0.1]]])
+    places = np.concatenate(
+        [[[0.0, 0.0]], np.stack([np.cos(angles), np.sin(angles)], -1), [[2.0, 0.1]]]
+    )
     places[7, 0] = 1 + np.sqrt(1 - 0.01)
     pairs = [(0, k) for k in range(1, 7)] + [(k, k % 6 + 1) for k in range(1, 7)] + [(1, 7)]
     i, j = np.array(pairs).T
@@ -115,7 +139,9 @@ def test_velocities_are_differentiable_where_impulses_are_not_unique():
     inwards = np.zeros((MAX_DISCS, 2))
     inwards[1:7] = -0.1 * places[1:7]  # so that every contact of the hexagon presses
     inwards[7] = -1.0, 0.2
-    along = np.random.default_rng(0).normal(size=inwards.shape) * (np.arange(MAX_DISCS) < 8)[:, None]
+    along = (
+        np.random.default_rng(0).normal(size=inwards.shape) * (np.arange(MAX_DISCS) < 8)[:, None]
+    )
     ends = [after(jnp.asarray(inwards + sign * 1e-5 * along)) for sign in (1, -1)]
     _, change = jax.jvp(after, (jnp.asarray(inwards),), (jnp.asarray(along),))
     np.testing.assert_allclose(change, (ends[0] - ends[1]) / 2e-5, rtol=0, atol=1e-6)
@@ -123,7 +149,16 @@ def test_velocities_are_differentiable_where_impulses_are_not_unique():
 
 # Through time
 
-NAMES = ("restitution", "shear_rate", "timestep", "side", "radii", "masses", "positions", "velocities")
+NAMES = (
+    "restitution",
+    "shear_rate",
+    "timestep",
+    "side",
+    "radii",
+    "masses",
+    "positions",
+    "velocities",
+)
 
 
 def parameters(flow: ShearFlow, state: State) -> dict:
@@ -140,7 +175,9 @@ def changed(flow: ShearFlow, state: State, values: dict) -> tuple[ShearFlow, Sta
     """The flow and the state with these parameters."""
     flow = replace(flow, **{name: values[name] for name in NAMES[:3]})
     grains = Grains(values["radii"], values["masses"])
-    return flow, State(grains, values["positions"], values["velocities"], values["side"], state.tilt)
+    return flow, State(
+        grains, values["positions"], values["velocities"], values["side"], state.tilt
+    )
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +205,9 @@ def score_of(tilting, run):
 
     @jax.jit
     def score(after: State):
-        moved = displacement(after.positions, end.positions, lax.stop_gradient(after.side), after.tilt)
+        moved = displacement(
+            after.positions, end.positions, lax.stop_gradient(after.side), after.tilt
+        )
         return jnp.sum(weights[0] * moved) + jnp.sum(weights[1] * after.velocities)
 
     return score
@@ -176,7 +215,9 @@ def score_of(tilting, run):
 
 @pytest.fixture(scope="module")
 def backward(tilting, score_of, events_of):
-    """``backward(values, steps)``: value, tally and gradient of the score, in a loop with the events of ``STEPS``."""
+    """``backward(values, steps)``: value, tally and gradient of the score, in a loop with the
+    events of ``STEPS``.
+    """
     events = events_of(STEPS)
 
     @jax.jit
@@ -200,7 +241,9 @@ def derivative(tilting, backward):
 
 @pytest.fixture(scope="module")
 def forward(tilting, score_of):
-    """``forward(values, along)``: the derivative of the score along a direction, in forward mode."""
+    """``forward(values, along)``: the derivative of the score along a direction, in forward
+    mode.
+    """
 
     def score(values: dict):
         return score_of(exact_advance(*changed(*tilting, values), jnp.int32(STEPS))[0])
@@ -213,15 +256,21 @@ def test_loop_of_fixed_length_has_the_values_of_the_advance(tilting, derivative,
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_gradient_of_a_run_is_that_of_finite_differences(tilting, derivative, forward, score_of, run, name):
-    """Across new lists and a remap of the tilt; the radii decide in which steps grains meet, and nothing else."""
+def test_gradient_of_a_run_is_that_of_finite_differences(
+    tilting, derivative, forward, score_of, run, name
+):
+    """Across new lists and a remap of the tilt; the radii decide in which steps grains meet, and
+    nothing else.
+    """
     at = parameters(*tilting)
     along = jnp.asarray(np.random.default_rng(1).normal(size=at[name].shape))
     step = 1e-8
     ends = []
     for sign in (1, -1):
         flow, start = changed(*tilting, at | {name: at[name] + sign * step * along})
-        flow = replace(flow, **{number: float(getattr(flow, number)) for number in NAMES[:3]})  # compiled for such
+        flow = replace(
+            flow, **{number: float(getattr(flow, number)) for number in NAMES[:3]}
+        )  # compiled for such
         ends.append(score_of(run(flow, start, STEPS)[0]))
     high, low = ends
     numerical, exact = float((high - low) / (2 * step)), float(jnp.sum(derivative[1][name] * along))
@@ -244,7 +293,9 @@ def test_numbers_and_derivatives_are_nan_where_events_do_not_suffice(tilting, ba
 
 
 def collision(gap, scene, dt: float, moving_contacts: bool):
-    """Where the left of two equal discs, the other at rest, is a time after it hits: head on, at rest in the shear."""
+    """Where the left of two equal discs, the other at rest, is a time after it hits: head on, at
+    rest in the shear.
+    """
     state = scene([[3.0, 0.0], [4.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]])
     state = replace(state, positions=state.positions.at[1, 0].add(gap))
     flow = ShearFlow(GRAINS, 0.5, 0.02, dt)
@@ -253,14 +304,17 @@ def collision(gap, scene, dt: float, moving_contacts: bool):
 
 
 def test_a_contact_that_moves_in_time_has_the_derivative_of_the_event(scene):
-    """At fixed steps, the first disc has come no further when it has further to go: ∂x/∂gap = 0. In truth it meets the
-    other one later, and loses the velocity Δv later: ∂x/∂gap = Δv/u = (1 + α)/2. So says a difference over many steps.
+    """At fixed steps, the first disc has come no further when it has further to go: ∂x/∂gap = 0. In
+    truth it meets the other one later, and loses the velocity Δv later: ∂x/∂gap = Δv/u = (1 + α)/2.
+    So says a difference over many steps.
     """
     at, change = jnp.asarray(0.2 + 3e-4), 0.05
 
     @partial(jax.jit, static_argnums=1)
     def value_and_slope(gap, moving_contacts: bool):
-        return jax.jvp(lambda gap: collision(gap, scene, 1e-3, moving_contacts), (gap,), (jnp.ones_like(gap),))
+        return jax.jvp(
+            lambda gap: collision(gap, scene, 1e-3, moving_contacts), (gap,), (jnp.ones_like(gap),)
+        )
 
     (near, moving), (far, _) = value_and_slope(at, True), value_and_slope(at + change, True)
     np.testing.assert_allclose(moving, 0.75, atol=1e-9)
@@ -268,10 +322,11 @@ def test_a_contact_that_moves_in_time_has_the_derivative_of_the_event(scene):
 
 
 def test_at_a_kink_the_derivative_is_one_of_the_two_one_sided_ones(scene):
-    """A disc hits a second one that a third one touches at a right angle: the third contact neither presses nor parts.
+    """A disc hits a second one that a third one touches at a right angle: the third contact neither
+    presses nor parts.
 
-    Hit a little from above or from below, the second disc pushes the third or leaves it alone: the derivatives to
-    both sides differ, and the one returned is one of them.
+    Hit a little from above or from below, the second disc pushes the third or leaves it alone: the
+    derivatives to both sides differ, and the one returned is one of them.
     """
     touching = scene([[3.0, 4.0], [4.0, 4.0], [4.0, 3.0]], [[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     flow = ShearFlow(GRAINS, 0.0, 0.02, 1e-6)
@@ -280,7 +335,9 @@ def test_at_a_kink_the_derivative_is_one_of_the_two_one_sided_ones(scene):
     def pushed(slant):
         """Velocity of the third disc along y, where the first one comes at a slant."""
         turn = jnp.stack([jnp.cos(slant), -jnp.sin(slant)])
-        state = replace(touching, positions=touching.positions.at[0].set(touching.positions[1] - turn))
+        state = replace(
+            touching, positions=touching.positions.at[0].set(touching.positions[1] - turn)
+        )
         return advance_by_jax(flow, EXACT, state, jnp.int32(2))[0].velocities[2, 1]
 
     at, step = jnp.asarray(0.0), 1e-4

@@ -1,4 +1,6 @@
-"""Both engines against programs that share no code with them: from the same state, step by step and on average."""
+"""Both engines against programs that share no code with them: from the same state, step by step and
+on average.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -22,17 +24,25 @@ STEPS, DT = 200, 1e-3
 
 
 class Plain:
-    """The time step of contact dynamics in its plainest form: all pairs, all images, dense matrices."""
+    """The time step of contact dynamics in its plainest form: all pairs, all images, dense
+    matrices.
+    """
 
     def __init__(self, state: State, flow: jg.ShearFlow) -> None:
         self.x, self.c = np.array(state.positions), np.array(state.velocities)
         self.side, self.tilt = float(state.side), float(state.tilt)
         self.radii, self.masses = np.array(state.grains.radii), np.array(state.grains.masses)
-        self.rate, self.dt, self.alpha = float(flow.shear_rate), float(flow.timestep), float(flow.restitution)
+        self.rate, self.dt, self.alpha = (
+            float(flow.shear_rate),
+            float(flow.timestep),
+            float(flow.restitution),
+        )
         self.ahead, self.collisions = THETA[flow.activation] * self.dt, 0
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Grains i < j of each contact, unit normals from j to i, and relative normal velocities."""
+        """Grains i < j of each contact, unit normals from j to i, and relative normal
+        velocities.
+        """
         i, j = np.triu_indices(len(self.x), 1)
         s = nearest_image(self.x[i] - self.x[j], self.side, self.tilt)
         u = self.c[i] - self.c[j] + np.stack([self.rate * s[:, 1], np.zeros(len(s))], axis=1)
@@ -44,11 +54,17 @@ class Plain:
         n = s / np.linalg.norm(s, axis=1)[:, None]
         return i, j, n, np.sum(n * u, axis=1)
 
-    def impulses(self, i: np.ndarray, j: np.ndarray, n: np.ndarray, approach: np.ndarray) -> np.ndarray:
-        """Solution of 0 ≤ p ⟂ W p + (1 + α) u⁻ ≥ 0, which is that of the law u⁺ = u⁻ + W p, 0 ≤ p ⟂ u⁺ + α u⁻ ≥ 0."""
+    def impulses(
+        self, i: np.ndarray, j: np.ndarray, n: np.ndarray, approach: np.ndarray
+    ) -> np.ndarray:
+        """Solution of 0 ≤ p ⟂ W p + (1 + α) u⁻ ≥ 0, which is that of the law u⁺ = u⁻ + W p, 0 ≤ p ⟂
+        u⁺ + α u⁻ ≥ 0.
+        """
         h, rows = np.zeros((len(i), len(self.x), 2)), np.arange(len(i))
         h[rows, i], h[rows, j] = n, -n
-        solved = certified_impulses(h.reshape(len(i), -1) / np.repeat(np.sqrt(self.masses), 2), approach)
+        solved = certified_impulses(
+            h.reshape(len(i), -1) / np.repeat(np.sqrt(self.masses), 2), approach
+        )
         assert solved is not None
         return (1 + self.alpha) * solved
 
@@ -59,7 +75,9 @@ class Plain:
             p = self.impulses(i, j, n, approach)[:, None] * n
             np.add.at(self.c, i, p / self.masses[i, None])
             np.add.at(self.c, j, -p / self.masses[j, None])
-        self.x = self.x + self.dt * (self.c + self.rate * np.stack([self.x[:, 1], np.zeros(len(self.x))], axis=1))
+        self.x = self.x + self.dt * (
+            self.c + self.rate * np.stack([self.x[:, 1], np.zeros(len(self.x))], axis=1)
+        )
         self.c[:, 0] -= self.rate * self.dt * self.c[:, 1]
         self.tilt += self.rate * self.dt
         rows = np.floor(self.x[:, 1] / self.side)  # back into the cell, where few images suffice
@@ -77,16 +95,28 @@ def assert_same_motion(state: State, plain: Plain, atol: float) -> None:
 def fast_pair(gap: float, speed: float) -> State:
     """Two fast discs on their way to each other between two rows of discs at rest."""
     count = GRAINS - 2
-    places = np.stack([1.2 * (np.arange(count) % 15), 6.0 * (2 * (np.arange(count) // 15) - 1)], axis=1)
+    places = np.stack(
+        [1.2 * (np.arange(count) % 15), 6.0 * (2 * (np.arange(count) // 15) - 1)], axis=1
+    )
     positions = np.concatenate([[[-(1 + gap) / 2, 0.0], [(1 + gap) / 2, 0.0]], places - [8.5, 0.0]])
     velocities = np.zeros((GRAINS, 2))
     velocities[:2, 0] = speed, -speed
     grains = Grains(jnp.full(GRAINS, 0.5), jnp.ones(GRAINS))
-    return State(grains, jnp.asarray(positions + 10), jnp.asarray(velocities), jnp.asarray(20.0), jnp.asarray(0.0))
+    return State(
+        grains,
+        jnp.asarray(positions + 10),
+        jnp.asarray(velocities),
+        jnp.asarray(20.0),
+        jnp.asarray(0.0),
+    )
 
 
 @settings(max_examples=30)
-@given(gap=st.floats(0.1, 9), speed=st.floats(1, 25), activation=st.sampled_from(["midpoint", "touching"]))
+@given(
+    gap=st.floats(0.1, 9),
+    speed=st.floats(1, 25),
+    activation=st.sampled_from(["midpoint", "touching"]),
+)
 @example(5.5, 19.2, "midpoint")
 def test_fast_discs_do_not_pass_through_each_other(engine_run, gap, speed, activation) -> None:
     """The list of near pairs must reach as far as the contact rule looks ahead."""
@@ -119,11 +149,15 @@ def test_fast_discs_do_not_pass_through_each_other(engine_run, gap, speed, activ
 def test_fast_coarse_sparse_flows_move_as_by_the_plainest_program(
     packed, engine_run, packing_fraction, timestep, speed, shear_rate, activation, steps, seed
 ) -> None:
-    """No contact is missed and no grains change sides without an impulse, or the status says that lists are full."""
+    """No contact is missed and no grains change sides without an impulse, or the status says that
+    lists are full.
+    """
     velocities = speed * np.random.default_rng(seed).normal(size=(GRAINS, 2))
     still = packed(packing_fraction)
     state = State(still.grains, still.positions, jnp.asarray(velocities), still.side, still.tilt)
-    flow = flow_of(packing_fraction, timestep=timestep, shear_rate=shear_rate, activation=activation)
+    flow = flow_of(
+        packing_fraction, timestep=timestep, shear_rate=shear_rate, activation=activation
+    )
     after, tally = engine_run(flow, state, steps)
     assume(tally.status < Status.infeasible)
     plain = Plain(state, flow)
@@ -136,7 +170,9 @@ def test_fast_coarse_sparse_flows_move_as_by_the_plainest_program(
 @pytest.mark.parametrize("packing_fraction", [0.6, 0.78])
 def test_contacts_of_a_step_are_those_of_the_plainest_program(flowing, packing_fraction) -> None:
     state, flow = flowing(packing_fraction), flow_of(packing_fraction, timestep=0.03)
-    seen = jax.jit(lambda state: jg.snapshot_series(flow, state, float(flow.timestep), 1, solver=EXACT))(state)[1][0]
+    seen = jax.jit(
+        lambda state: jg.snapshot_series(flow, state, float(flow.timestep), 1, solver=EXACT)
+    )(state)[1][0]
     plain = Plain(seen.state, flow)
     i, j, n, approach = plain.contacts()
     used = np.asarray(seen.contacts.used)
@@ -148,25 +184,56 @@ def test_contacts_of_a_step_are_those_of_the_plainest_program(flowing, packing_f
     np.testing.assert_allclose(ours[2], plain.impulses(i, j, n, approach), atol=1e-8)
 
 
-@pytest.mark.parametrize(("packing_fraction", "activation"), [(0.4, "midpoint"), (0.7, "midpoint"), (0.78, "touching")])
-def test_sums_over_200_steps_are_those_of_the_classical_loop(flowing, engine_run, packing_fraction, activation) -> None:
-    """Lists, contacts, impulses and averages of two programs that were written apart, from the same state."""
-    state, flow = flowing(packing_fraction), flow_of(packing_fraction, activation=activation, restitution=0.8)
+@pytest.mark.parametrize(
+    ("packing_fraction", "activation"), [(0.4, "midpoint"), (0.7, "midpoint"), (0.78, "touching")]
+)
+def test_sums_over_200_steps_are_those_of_the_classical_loop(
+    flowing, engine_run, packing_fraction, activation
+) -> None:
+    """Lists, contacts, impulses and averages of two programs that were written apart, from the same
+    state.
+    """
+    state, flow = (
+        flowing(packing_fraction),
+        flow_of(packing_fraction, activation=activation, restitution=0.8),
+    )
     after, tally = engine_run(flow, state, STEPS)
-    grains, law = state.grains, {"shear_rate": 1.0, "restitution": 0.8, "timestep": DT, "tolerance": 1e-12}
+    grains, law = (
+        state.grains,
+        {"shear_rate": 1.0, "restitution": 0.8, "timestep": DT, "tolerance": 1e-12},
+    )
     at, sums = (state.positions, state.velocities, state.tilt), np.zeros(11)
     for _ in range(STEPS):
         *at, step = contact_dynamics.advance(
-            at[0], at[1], grains.radii, grains.masses, state.side, at[2], activation=THETA[activation], **law
+            at[0],
+            at[1],
+            grains.radii,
+            grains.masses,
+            state.side,
+            at[2],
+            activation=THETA[activation],
+            **law,
         )
         begin = at[1] + DT * np.stack([at[1][:, 1], np.zeros(GRAINS)], axis=1)  # after the impulses
-        kinetic = sum(w * np.einsum("i,ia,ib->ab", grains.masses, c, c) for w, c in simpson(begin, at[1]))
-        one = step.impulse, step.binary_impulse, *step.contact_stress, *step.binary_stress, *symmetric(kinetic)
+        kinetic = sum(
+            w * np.einsum("i,ia,ib->ab", grains.masses, c, c) for w, c in simpson(begin, at[1])
+        )
+        one = (
+            step.impulse,
+            step.binary_impulse,
+            *step.contact_stress,
+            *step.binary_stress,
+            *symmetric(kinetic),
+        )
         sums += one
     area = float(state.side) ** 2
     assert float(tally.collisions) > 5
     moments = (np.asarray(tally.contact_moment), np.asarray(tally.binary_moment))
-    found = [tally.impulse, tally.binary_impulse, *(x for m in moments for x in symmetric(m) / (area * DT))]
+    found = [
+        tally.impulse,
+        tally.binary_impulse,
+        *(x for m in moments for x in symmetric(m) / (area * DT)),
+    ]
     found = np.array([*found, *symmetric(np.asarray(tally.kinetic_moment)) / DT], float)
     scale = np.repeat([np.max(np.abs(part)) for part in np.split(sums, [2, 5, 8])], [2, 3, 3, 3])
     np.testing.assert_allclose(found / scale, sums / scale, atol=1e-6)
@@ -176,7 +243,9 @@ def test_sums_over_200_steps_are_those_of_the_classical_loop(flowing, engine_run
 
 
 def simpson(begin: np.ndarray, end: np.ndarray) -> list[tuple[float, np.ndarray]]:
-    """Weights and values whose sum of squares is the mean over a flight, in which velocities are linear in time."""
+    """Weights and values whose sum of squares is the mean over a flight, in which velocities are
+    linear in time.
+    """
     return [(1 / 6, begin), (4 / 6, (begin + end) / 2), (1 / 6, end)]
 
 

@@ -1,10 +1,17 @@
-"""The error of linear interpolation is zero at the points and for planes, and that of a parabola is exact."""
+"""The error of linear interpolation is zero at the points and for planes, and that of a parabola is
+exact.
+"""
 
 import numpy as np
 import xarray as xr
 from made_up_maps import ratio_dataset
 
-from jaxgran.plotting.interpolation import interpolated, interpolation_error, left_out_note, refined_axes
+from jaxgran.plotting.interpolation import (
+    interpolated,
+    interpolation_error,
+    left_out_note,
+    refined_axes,
+)
 
 
 def uneven_map() -> tuple[xr.Dataset, np.ndarray, np.ndarray]:

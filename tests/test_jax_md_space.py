@@ -1,4 +1,6 @@
-"""jax-md's functions on our states: pairs, structure and stresses are ours, and where its own space is wrong."""
+"""jax-md's functions on our states: pairs, structure and stresses are ours, and where its own space
+is wrong.
+"""
 
 from dataclasses import replace
 
@@ -14,7 +16,9 @@ import jaxgran as jg
 from jaxgran.model.cell import displacement
 from jaxgran.model.state import State
 
-pytestmark = pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types")  # of jax-md's lists
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:scatter inputs have incompatible types"
+)  # of jax-md's lists
 TILTS = (-0.5, 0.3)
 CUTOFF = 1.6  # σ
 EPS = np.finfo(float).eps
@@ -58,26 +62,42 @@ def test_neighbour_lists_of_jax_md_have_our_pairs(tilt: float, state: State) -> 
     assert pairs_of(of_ours.allocate(here.positions)) == pairs_within(here, CUTOFF) != set()
     fractions = here.positions @ jnp.linalg.inv(box).T % 1
     theirs = space.periodic_general(box)[0]
-    of_theirs = partition.neighbor_list(theirs, box, CUTOFF, 0.0, fractional_coordinates=True, format=sparse)
+    of_theirs = partition.neighbor_list(
+        theirs, box, CUTOFF, 0.0, fractional_coordinates=True, format=sparse
+    )
     assert pairs_of(of_theirs.allocate(fractions)) == pairs_within(here, CUTOFF)
 
 
 @pytest.mark.parametrize("tilt", TILTS)
 def test_stress_and_temperature_of_jax_md_are_ours(tilt: float, state: State) -> None:
-    """Of discs with the energy ½ (d − r)², the stress is −Σ f ⊗ r over the area, of pairs in the sheared cell."""
+    """Of discs with the energy ½ (d − r)², the stress is −Σ f ⊗ r over the area, of pairs in the
+    sheared cell.
+    """
     from jax_md import quantity, smap
 
     here = replace(state, tilt=jnp.asarray(tilt))
     space = jg.jax_md_space(here)
-    energy = smap.pair(lambda r, **_: jnp.where(r < CUTOFF, (CUTOFF - r) ** 2 / 2, 0), jg_metric(space.displacement))
+    energy = smap.pair(
+        lambda r, **_: jnp.where(r < CUTOFF, (CUTOFF - r) ** 2 / 2, 0),
+        jg_metric(space.displacement),
+    )
     found = quantity.stress(energy, here.positions, space.box)
     separations = all_separations(here)
     distances = np.linalg.norm(separations, axis=-1) + np.eye(GRAINS)
-    force = np.where((distances < CUTOFF) & ~np.eye(GRAINS, dtype=bool), CUTOFF - distances, 0) / distances
-    expected = np.einsum("ij,ija,ijb->ab", force, separations, separations) / 2 / float(here.side) ** 2
-    np.testing.assert_allclose(found, expected, rtol=0, atol=64 * EPS * GRAINS * np.max(np.abs(expected)))
+    force = (
+        np.where((distances < CUTOFF) & ~np.eye(GRAINS, dtype=bool), CUTOFF - distances, 0)
+        / distances
+    )
+    expected = (
+        np.einsum("ij,ija,ijb->ab", force, separations, separations) / 2 / float(here.side) ** 2
+    )
+    np.testing.assert_allclose(
+        found, expected, rtol=0, atol=64 * EPS * GRAINS * np.max(np.abs(expected))
+    )
     masses, velocities = here.grains.masses[:, None], here.velocities
-    np.testing.assert_allclose(quantity.temperature(velocity=velocities, mass=masses), 1, rtol=64 * EPS)
+    np.testing.assert_allclose(
+        quantity.temperature(velocity=velocities, mass=masses), 1, rtol=64 * EPS
+    )
 
 
 def jg_metric(displacement):
@@ -88,12 +108,20 @@ def jg_metric(displacement):
 
 def test_derivatives_with_respect_to_the_box_are_those_of_differences() -> None:
     to, origin, side, dt = jnp.asarray([1.0, 9.0]), jnp.asarray([2.0, 1.0]), 10.0, 1e-6
-    ours = jg.jax_md_space(State(None, None, None, jnp.asarray(side), jnp.asarray(0.0))).displacement
+    ours = jg.jax_md_space(
+        State(None, None, None, jnp.asarray(side), jnp.asarray(0.0))
+    ).displacement
 
     def apart(tilt):
-        return ours(to, origin, box=jnp.asarray([[side, 0.0], [0.0, side]]) + tilt * jnp.asarray([[0, side], [0, 0]]))
+        return ours(
+            to,
+            origin,
+            box=jnp.asarray([[side, 0.0], [0.0, side]]) + tilt * jnp.asarray([[0, side], [0, 0]]),
+        )
 
-    np.testing.assert_allclose((apart(0.1 + dt) - apart(0.1 - dt)) / (2 * dt), [-side, 0], atol=1e-6)
+    np.testing.assert_allclose(
+        (apart(0.1 + dt) - apart(0.1 - dt)) / (2 * dt), [-side, 0], atol=1e-6
+    )
     np.testing.assert_allclose(jax.jacfwd(apart)(0.1), [-side, 0], atol=64 * EPS * side)
 
 
@@ -110,7 +138,9 @@ def test_batch_is_refused_and_vmap_applies(state: State) -> None:
     with pytest.raises(jg.InputError, match="state must be one State"):
         jg.jax_md_space(several)
     distances = jax.vmap(lambda one: jg.jax_md_space(one).displacement(*one.positions[:2]))(several)
-    np.testing.assert_array_equal(distances[0], jg.jax_md_space(state).displacement(*state.positions[:2]))
+    np.testing.assert_array_equal(
+        distances[0], jg.jax_md_space(state).displacement(*state.positions[:2])
+    )
 
 
 def test_simulator_of_the_notebook_has_the_impulses_of_a_sample(monkeypatch) -> None:

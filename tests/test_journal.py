@@ -1,4 +1,6 @@
-"""A batch that was cut off anywhere goes on from its journal with the bits that it would have had."""
+"""A batch that was cut off anywhere goes on from its journal with the bits that it would have
+had.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,9 @@ from jaxgran.sampling.batch import advance_batch, stack
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 
 KEYS = [(0, 0), (1, 0)]
-GRAINS = 32  # as in the tests of the protocol and of maps, whose keys are numbers too: compiled once
+GRAINS = (
+    32  # as in the tests of the protocol and of maps, whose keys are numbers too: compiled once
+)
 
 
 @pytest.fixture
@@ -77,7 +81,9 @@ def fake_drive(flow, numerics, state: State, steps, observe=None):
 
 def small_state() -> State:
     ones = jnp.ones((2, 4))
-    return State(Grains(ones, ones), jnp.zeros((2, 4, 2)), jnp.zeros((2, 4, 2)), jnp.ones(2), jnp.zeros(2))
+    return State(
+        Grains(ones, ones), jnp.zeros((2, 4, 2)), jnp.zeros((2, 4, 2)), jnp.ones(2), jnp.zeros(2)
+    )
 
 
 def walk(advance, calls: int) -> list:

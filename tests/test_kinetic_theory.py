@@ -13,7 +13,10 @@ from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.navier_stokes import garzo_dufty
 from jaxgran.theory.steady_shear import SteadyShear, contact_value, maxwellian_collision_rate
 
-PLANE = [axis.ravel() for axis in np.meshgrid(np.append(np.arange(0, 1, 0.1), 0.99), [0.01, 0.1, 0.3, 0.5, 0.7, 0.83])]
+PLANE = [
+    axis.ravel()
+    for axis in np.meshgrid(np.append(np.arange(0, 1, 0.1), 0.99), [0.01, 0.1, 0.3, 0.5, 0.7, 0.83])
+]
 
 
 def moments(restitution, packing_fraction, shear_rate=1.0, polydispersity=0.26) -> SteadyShear:
@@ -46,18 +49,25 @@ def temperature_and_stresses(shear: SteadyShear) -> np.ndarray:
         (moments, 0.5, 0.6, (0.238, 1.20, 0.676)),
     ],
 )
-def test_temperature_and_stresses_agree_with_an_independent_solution(theory, restitution, packing_fraction, expected):
+def test_temperature_and_stresses_agree_with_an_independent_solution(
+    theory, restitution, packing_fraction, expected
+):
     predicted = temperature_and_stresses(theory(restitution, packing_fraction))
-    half_a_digit = [0.5 * 10.0 ** -len(str(value).split(".")[1].ljust(2, "0")) for value in expected]
+    half_a_digit = [
+        0.5 * 10.0 ** -len(str(value).split(".")[1].ljust(2, "0")) for value in expected
+    ]
     assert np.all(np.abs(predicted - expected) <= half_a_digit)
 
 
-# Event-driven hard discs, diameters uniform in 1 ± 0.26: packing fraction, restitution, pressure, collision rate
+# Event-driven hard discs, diameters uniform in 1 ± 0.26: packing fraction, restitution, pressure,
+# collision rate
 @pytest.mark.parametrize(
     ("packing_fraction", "restitution", "pressure", "collision_rate"),
     [(0.2, 0.9, 4.185, 4.27), (0.6, 0.9, 9.814, 18.2)],
 )
-def test_moments_come_close_to_event_driven_discs(packing_fraction, restitution, pressure, collision_rate):
+def test_moments_come_close_to_event_driven_discs(
+    packing_fraction, restitution, pressure, collision_rate
+):
     predicted = moments(restitution, packing_fraction)
     np.testing.assert_allclose(predicted.pressure, pressure, rtol=0.06)
     np.testing.assert_allclose(predicted.collision_rate, collision_rate, rtol=0.06)
@@ -65,20 +75,30 @@ def test_moments_come_close_to_event_driven_discs(packing_fraction, restitution,
 
 @pytest.mark.parametrize("restitution", [0.3, 0.5, 0.9])
 def test_collisions_are_those_of_the_velocities_in_the_source(restitution):
-    """The mean relative speed of a Maxwellian with a Sonine term of weight a₂, by quadrature, to first order in a₂."""
+    """The mean relative speed of a Maxwellian with a Sonine term of weight a₂, by quadrature, to
+    first order in a₂.
+    """
     nodes, weights = np.polynomial.hermite.hermgauss(16)
     c = np.stack(np.meshgrid(*[nodes] * 4, indexing="ij"))
     weight = np.prod(np.meshgrid(*[weights] * 4, indexing="ij"), axis=0)
     squared = c[0] ** 2 + c[1] ** 2
     speed = np.hypot(c[0] - c[2], c[1] - c[3])
-    change = 2 * np.sum(weight * (squared**2 / 2 - 2 * squared + 1) * speed) / np.sum(weight * speed)
+    change = (
+        2 * np.sum(weight * (squared**2 / 2 - 2 * squared + 1) * speed) / np.sum(weight * speed)
+    )
     alpha, nu = restitution, 0.4
-    kurtosis = 16 * (1 - alpha) * (1 - 2 * alpha**2) / (57 - 25 * alpha + 30 * alpha**2 * (1 - alpha))
+    kurtosis = (
+        16 * (1 - alpha) * (1 - 2 * alpha**2) / (57 - 25 * alpha + 30 * alpha**2 * (1 - alpha))
+    )
     found = garzo_dufty(alpha, nu)
-    maxwellian = maxwellian_collision_rate(4 * nu / np.pi, contact_value(nu), found.granular_temperature)
+    maxwellian = maxwellian_collision_rate(
+        4 * nu / np.pi, contact_value(nu), found.granular_temperature
+    )
     excess = float(found.collision_rate / maxwellian) - 1
     assert abs(excess) > 1e-4
-    assert excess == pytest.approx(change * kurtosis, rel=0.1)  # of the quadrature, whose integrand has a cusp
+    assert excess == pytest.approx(
+        change * kurtosis, rel=0.1
+    )  # of the quadrature, whose integrand has a cusp
 
 
 @pytest.mark.parametrize("theory", THEORIES)
@@ -97,7 +117,9 @@ def test_shear_power_equals_dissipation(theory):
 @pytest.mark.parametrize("theory", THEORIES)
 def test_stresses_grow_with_the_square_of_the_shear_rate(theory):
     slow, fast = theory(0.8, 0.5, 1.0), theory(0.8, 0.5, 3.0)
-    np.testing.assert_allclose(temperature_and_stresses(fast), 9 * temperature_and_stresses(slow), rtol=1e-12)
+    np.testing.assert_allclose(
+        temperature_and_stresses(fast), 9 * temperature_and_stresses(slow), rtol=1e-12
+    )
     np.testing.assert_allclose(fast.collision_rate, slow.collision_rate, rtol=1e-12)
     np.testing.assert_allclose(fast.dissipation_rate, fast.shear_stress * 3.0, rtol=1e-12)
 
@@ -106,21 +128,32 @@ def test_stresses_grow_with_the_square_of_the_shear_rate(theory):
 def test_theories_of_one_size_agree_in_the_elastic_limit(packing_fraction):
     def distance(restitution):
         found = moments(restitution, packing_fraction, 1.0, 0.0)
-        return np.abs(numbers(found) / numbers(garzo_dufty(restitution, packing_fraction)) - 1).max()
+        return np.abs(
+            numbers(found) / numbers(garzo_dufty(restitution, packing_fraction)) - 1
+        ).max()
 
     assert distance(1 - 1e-4) < 1e-3
-    np.testing.assert_allclose(distance(1 - 1e-4) / distance(1 - 1e-3), 0.1, rtol=0.05)  # first order in 1 − α
+    np.testing.assert_allclose(
+        distance(1 - 1e-4) / distance(1 - 1e-3), 0.1, rtol=0.05
+    )  # first order in 1 − α
 
 
 def test_velocities_become_isotropic_in_the_elastic_limit():
     nearly, more_nearly = (moments(alpha, 0.4) for alpha in (0.9999, 0.999999))
-    friction = nearly.shear_stress / nearly.pressure, more_nearly.shear_stress / more_nearly.pressure
-    np.testing.assert_allclose(friction[1] / friction[0], 0.1, rtol=0.01)  # as the square root of 1 − α
+    friction = (
+        nearly.shear_stress / nearly.pressure,
+        more_nearly.shear_stress / more_nearly.pressure,
+    )
+    np.testing.assert_allclose(
+        friction[1] / friction[0], 0.1, rtol=0.01
+    )  # as the square root of 1 − α
 
 
 def test_one_size_is_the_limit_of_many():
     one_size = gaussian_moments(0.7, 0.5, polydispersity=0.0, size_classes=1)
-    np.testing.assert_allclose(numbers(moments(0.7, 0.5, polydispersity=0.0)), numbers(one_size), rtol=1e-12)
+    np.testing.assert_allclose(
+        numbers(moments(0.7, 0.5, polydispersity=0.0)), numbers(one_size), rtol=1e-12
+    )
 
 
 def test_contact_value_starts_from_the_second_virial_coefficient():
@@ -140,26 +173,40 @@ def test_collisional_transfer_is_that_of_the_moments_at_equal_temperatures():
 
 
 def test_enskogs_dissipation_vanishes_in_the_elastic_limit_as_one_minus_the_squared_restitution():
-    losses = [collisional_transfer(jnp.eye(2), alpha, 0.5).dissipation_rate for alpha in (1.0, 0.9, 0.0)]
+    losses = [
+        collisional_transfer(jnp.eye(2), alpha, 0.5).dissipation_rate for alpha in (1.0, 0.9, 0.0)
+    ]
     np.testing.assert_allclose(losses, [0, 0.19 * losses[2], losses[2]], rtol=1e-12)
 
 
 def test_collisional_transfer_of_slow_shear_has_the_viscosity_of_isotropic_collisions():
-    """Half of γ_b = (8/π) ν² χ (1 + α), in units of √(T/4π): V. Garzó and J. W. Dufty (1999) at vanishing shear."""
+    """Half of γ_b = (8/π) ν² χ (1 + α), in units of √(T/4π): V. Garzó and J. W. Dufty (1999) at
+    vanishing shear.
+    """
     alpha, nu, rate, temperature = 0.8, 0.5, 1e-4, 2.0
     found = collisional_transfer(temperature * jnp.eye(2), alpha, nu, rate, 0.0)
     bulk = 8 / np.pi * nu**2 * float(contact_value(nu)) * (1 + alpha)
-    np.testing.assert_allclose(-found.stress[0, 1] / rate, bulk / 2 * np.sqrt(temperature / (4 * np.pi)), rtol=1e-6)
-    speed = found.speed_stress[0, 0] / found.stress[0, 0]  # ⟨w³⟩ / ⟨w²⟩ of a half-Gaussian of variance 2T
+    np.testing.assert_allclose(
+        -found.stress[0, 1] / rate, bulk / 2 * np.sqrt(temperature / (4 * np.pi)), rtol=1e-6
+    )
+    speed = (
+        found.speed_stress[0, 0] / found.stress[0, 0]
+    )  # ⟨w³⟩ / ⟨w²⟩ of a half-Gaussian of variance 2T
     np.testing.assert_allclose(speed, 2 * np.sqrt(2 / np.pi) * np.sqrt(2 * temperature), rtol=1e-6)
 
 
 def test_collision_integrals_equal_averages_over_sampled_collisions():
-    """Applies the rule of collision to random pairs, and compares with the closed forms within five standard errors."""
+    """Applies the rule of collision to random pairs, and compares with the closed forms within five
+    standard errors.
+    """
     alpha, nu, samples = 0.6, 0.5, 100_000
-    mixture = jax.tree.map(np.asarray, moments_module.uniform_mixture(jnp.asarray(nu), jnp.asarray(0.26), 2))
+    mixture = jax.tree.map(
+        np.asarray, moments_module.uniform_mixture(jnp.asarray(nu), jnp.asarray(0.26), 2)
+    )
     tensors = np.array([[0.5, 0.7], [0.3, 0.4], [-0.1, -0.15]])  # xx, yy, xy of the two classes
-    predicted = jax.jit(moments_module._collisions)(jnp.asarray(tensors), jnp.asarray(alpha), mixture)
+    predicted = jax.jit(moments_module._collisions)(
+        jnp.asarray(tensors), jnp.asarray(alpha), mixture
+    )
     masses, densities = mixture.masses, mixture.number_densities
     rng = np.random.default_rng(7)
 
@@ -175,7 +222,9 @@ def test_collision_integrals_equal_averages_over_sampled_collisions():
                 for (xx, yy, xy), m in ((tensors[:, i], masses[i]), (tensors[:, j], masses[j]))
             )
             relative = own - other
-            relative[:, 0] -= distance * normal[:, 1]  # the flow at the partner's centre, shear rate 1
+            relative[:, 0] -= (
+                distance * normal[:, 1]
+            )  # the flow at the partner's centre, shear rate 1
             approach = np.maximum(np.sum(relative * normal, axis=1), 0)
             weight = 2 * np.pi * mixture.encounters[i, j] * approach
             impulse = (1 + alpha) * mixture.reduced_masses[i, j] * approach
@@ -205,15 +254,20 @@ def assert_mean(sample, expected):
     assert np.all(np.abs(np.mean(sample, axis=0) - expected) < 5 * error)
 
 
-# moderate, and far from elastic in dense flow: restitution, packing fraction, shear rate, polydispersity
+# moderate, and far from elastic in dense flow: restitution, packing fraction, shear rate,
+# polydispersity
 @pytest.mark.parametrize("point", [(0.8, 0.5, 1.3, 0.26), (0.1, 0.78, 1.0, 0.2)])
 def test_derivatives_of_the_moments_equal_finite_differences(point):
     def central_difference(direction):
-        ahead, behind = (moments(*(np.array(point) + s * direction).tolist()) for s in (1e-5, -1e-5))
+        ahead, behind = (
+            moments(*(np.array(point) + s * direction).tolist()) for s in (1e-5, -1e-5)
+        )
         return (numbers(ahead) - numbers(behind)) / 2e-5
 
     expected = np.stack([central_difference(direction) for direction in np.eye(4)], axis=1)
-    np.testing.assert_allclose(jacobian_of_moments(jnp.array(point)), expected, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(
+        jacobian_of_moments(jnp.array(point)), expected, rtol=1e-6, atol=1e-7
+    )
 
 
 jacobian_of_moments = jax.jit(jax.jacrev(lambda point: jnp.stack(jax.tree.leaves(moments(*point)))))
@@ -222,11 +276,15 @@ jacobian_of_moments = jax.jit(jax.jacrev(lambda point: jnp.stack(jax.tree.leaves
 def test_one_elastic_replica_leaves_the_others_alone():
     restitutions, packing_fractions = PLANE
     disturbed = np.where(np.arange(restitutions.size) == 5, 1.0, restitutions)
-    before, after = (numbers(batched(moments)(alpha, packing_fractions)) for alpha in (restitutions, disturbed))
+    before, after = (
+        numbers(batched(moments)(alpha, packing_fractions)) for alpha in (restitutions, disturbed)
+    )
     np.testing.assert_array_equal(np.delete(after, 5, axis=1), np.delete(before, 5, axis=1))
 
 
 def test_moments_that_newtons_method_does_not_find_are_not_finite() -> None:
-    """So close to one, rounding of the restitution leaves no root: steps stay above the tolerance."""
+    """So close to one, rounding of the restitution leaves no root: steps stay above the
+    tolerance.
+    """
     assert np.isnan(numbers(moments(1 - 1e-12, 0.5))).all()
     assert np.isfinite(numbers(moments(1 - 1e-6, 0.5))).all()

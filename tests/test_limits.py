@@ -18,14 +18,24 @@ LAW = (0.45, 0.004, 0.1, 0.8, 0.82)  # s, a, b, m, ν_w
 
 
 def study(noise: float, seed: int = 0) -> list[dict]:
-    """Twenty flows whose averages approach 2 by one law, with noise of the stated relative errors."""
+    """Twenty flows whose averages approach 2 by one law, with noise of the stated relative
+    errors.
+    """
     rng, rows = np.random.default_rng(seed), []
     for alpha in (0.1, 0.3, 0.5, 0.7, 0.9):
         for nu in (0.2, 0.5, 0.7, 0.75):
             flow = Flow("", alpha, nu, np.array(GRAINS, float), np.array(()), np.array(()))
             for grains, missing in zip(GRAINS, missing_part(np.array(LAW), flow), strict=True):
-                values = {name: [2 * (1 - missing) * (1 + noise * rng.normal()), 2 * noise] for name in AVERAGES}
-                point = {"restitution": alpha, "packing_fraction": nu, "grains": grains, "source": "loose"}
+                values = {
+                    name: [2 * (1 - missing) * (1 + noise * rng.normal()), 2 * noise]
+                    for name in AVERAGES
+                }
+                point = {
+                    "restitution": alpha,
+                    "packing_fraction": nu,
+                    "grains": grains,
+                    "source": "loose",
+                }
                 rows.append(point | values)
     return rows
 
@@ -33,7 +43,9 @@ def study(noise: float, seed: int = 0) -> list[dict]:
 def test_the_law_that_made_the_averages_is_found_within_its_errors() -> None:
     found = law_of(flows_of(study(1e-3), AVERAGES[0]))
     assert np.all(abs(np.array(found["constants"]) - LAW) < 4 * np.array(found["stderrs"]))
-    assert found["chi_squared"] / found["freedom"] == pytest.approx(1, abs=4 * np.sqrt(2 / found["freedom"]))
+    assert found["chi_squared"] / found["freedom"] == pytest.approx(
+        1, abs=4 * np.sqrt(2 / found["freedom"])
+    )
 
 
 def test_the_shared_exponent_is_in_its_interval_and_chi_squared_excludes_a_logarithm() -> None:

@@ -1,4 +1,6 @@
-"""A sample is the strain asked for, in blocks that add up, alone or in a batch, and only where positions resolve it."""
+"""A sample is the strain asked for, in blocks that add up, alone or in a batch, and only where
+positions resolve it.
+"""
 
 import re
 from dataclasses import replace
@@ -28,7 +30,9 @@ FLOWS = [ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0.5, 0.9)]
 
 @pytest.fixture(scope="module")
 def batch() -> Batch:
-    keys = jax.random.split(jax.random.PRNGKey(0), 2)  # numbers, as in a map: compiled once for both
+    keys = jax.random.split(
+        jax.random.PRNGKey(0), 2
+    )  # numbers, as in a map: compiled once for both
     return prepare_batch(stack(FLOWS), keys, equilibrate=0.5)
 
 
@@ -57,7 +61,9 @@ def test_blocks_add_up_to_the_whole(batch, measured) -> None:
     tally, whole = measured[1].tally, replica(whole, 0)
     for name in TABLE:
         if name not in (*EXTREMES, *OF_INSTANTS):
-            np.testing.assert_allclose(np.sum(getattr(tally, name), axis=0), getattr(whole, name), rtol=1e-5, atol=1e-9)
+            np.testing.assert_allclose(
+                np.sum(getattr(tally, name), axis=0), getattr(whole, name), rtol=1e-5, atol=1e-9
+            )
     assert np.max(tally.largest_overlap) == pytest.approx(float(whole.largest_overlap), rel=1e-5)
     np.testing.assert_allclose(measured[0].velocities, end.velocities[0], atol=1e-6)
     assert np.sum(tally.duration) == pytest.approx(STRAIN)
@@ -74,11 +80,19 @@ def test_averages_are_those_of_all_blocks_together() -> None:
     tally = random_tally(np.random.default_rng(0), BLOCKS)
     one = Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS)
     assert one.force_ratio == pytest.approx(tally.impulse.sum() / tally.binary_impulse.sum())
-    stress = (tally.contact_moment + tally.kinetic_moment).sum(axis=0) / tally.duration.sum() / 100.0
+    stress = (
+        (tally.contact_moment + tally.kinetic_moment).sum(axis=0) / tally.duration.sum() / 100.0
+    )
     assert one.pressure == pytest.approx(np.trace(stress) / 2)
     assert one.shear_stress == pytest.approx(-stress[0, 1])
     assert one.averages["max_overlap"] == tally.largest_overlap.max()
-    for name in ("granular_temperature", "contact_stress", "binary_stress", "kinetic_stress", "stress_ratio"):
+    for name in (
+        "granular_temperature",
+        "contact_stress",
+        "binary_stress",
+        "kinetic_stress",
+        "stress_ratio",
+    ):
         np.testing.assert_array_equal(getattr(one, name), one.averages[name])
 
 
@@ -94,7 +108,9 @@ def test_deep_overlaps_are_judged_by_their_share_of_all_contacts_of_a_sample() -
 
 
 def test_errors_of_a_batch_are_those_of_each_replica_which_an_index_takes() -> None:
-    both = Sample(random_tally(np.random.default_rng(3), 2, BLOCKS), np.full(2, 100.0), np.ones(2), GRAINS)
+    both = Sample(
+        random_tally(np.random.default_rng(3), 2, BLOCKS), np.full(2, 100.0), np.ones(2), GRAINS
+    )
     errors = both.errors()
     assert set(errors) == set(OBSERVABLES)
     for k, one in enumerate(both):
@@ -104,7 +120,9 @@ def test_errors_of_a_batch_are_those_of_each_replica_which_an_index_takes() -> N
     np.testing.assert_array_equal(both[1:].pressure, both.pressure[1:])
     with pytest.raises(IndexError):
         both[2]
-    with pytest.raises(InputError, match=r"^an index takes one of a batch, and this is one Sample, not a batch"):
+    with pytest.raises(
+        InputError, match=r"^an index takes one of a batch, and this is one Sample, not a batch"
+    ):
         both[0][0]
 
 
@@ -112,7 +130,9 @@ def test_averages_of_a_sample_are_of_numpy_and_those_that_jax_traces(measured) -
     """JAX would compile dozens of small sums at the first access."""
     assert all(isinstance(x, np.ndarray | np.generic) for x in measured[1].averages.values())
     traced = jax.jit(lambda one: (one.averages, one.status))(measured[1])
-    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-15), traced[0], measured[1].averages)
+    jax.tree.map(
+        partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-15), traced[0], measured[1].averages
+    )
     assert traced[1] == measured[1].status
 
 
@@ -136,13 +156,17 @@ def test_float32_is_refused_where_it_cannot_resolve_the_time_step(state) -> None
 
 def test_a_flow_that_is_not_that_of_the_state_is_refused(state) -> None:
     for name, value in (("packing_fraction", 0.601), ("polydispersity", 0.2)):
-        with refused(f"^{name} must be {getattr(FLOWS[0], name)}, which the state has, not {value}: "):
+        with refused(
+            f"^{name} must be {getattr(FLOWS[0], name)}, which the state has, not {value}: "
+        ):
             sample(replace(FLOWS[0], **{name: value}), state, STRAIN)
     require_match(FLOWS[0], in_float32(state))
 
 
 def test_a_sample_below_four_correlation_strains_says_so_however_it_is_taken(state) -> None:
-    """Alone, compiled, in a batch, as replicas of ``vmap`` and block by block; its strain compiles nothing anew."""
+    """Alone, compiled, in a batch, as replicas of ``vmap`` and block by block; its strain compiles
+    nothing anew.
+    """
     few = 0.32
     taken = [
         sample(FLOWS[0], state, few),
@@ -152,12 +176,16 @@ def test_a_sample_below_four_correlation_strains_says_so_however_it_is_taken(sta
     assert [int(one.status) for _, one in taken] == [Status.short_sample] * 3
     both = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), state)
     assert np.all(np.asarray(sample(FLOWS[0], both, few)[1].status) == Status.short_sample)
-    assert np.all(jax.vmap(lambda one: sample(FLOWS[0], one, few)[1].status)(both) == Status.short_sample)
+    assert np.all(
+        jax.vmap(lambda one: sample(FLOWS[0], one, few)[1].status)(both) == Status.short_sample
+    )
     compiled = _sample._cache_size()
     _, long = sample(FLOWS[0], state, 40.0)
     assert long.status == Status.ok and _sample._cache_size() == compiled
 
 
 def test_spread_of_the_largest_of_one_block_is_unknown() -> None:
-    one = Sample(random_tally(np.random.default_rng(2), 1), np.float64(100.0), np.float64(1.0), GRAINS)
+    one = Sample(
+        random_tally(np.random.default_rng(2), 1), np.float64(100.0), np.float64(1.0), GRAINS
+    )
     assert np.isnan(one.errors()["max_overlap"]) and np.isnan(one.errors()["pressure"])

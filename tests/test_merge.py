@@ -1,4 +1,6 @@
-"""Maps that are merged are those of one run to the bit, and what does not belong together is refused in a sentence."""
+"""Maps that are merged are those of one run to the bit, and what does not belong together is
+refused in a sentence.
+"""
 
 import shlex
 from dataclasses import replace
@@ -35,21 +37,29 @@ CLUSTER = Path(__file__).parents[1] / "docs" / "how-to" / "cluster.md"
 
 @pytest.fixture(scope="module")
 def replicas() -> dict[Key, Replica]:
-    """The replicas of all points: one that is not steady, one that is infeasible, and one that is not finite."""
+    """The replicas of all points: one that is not steady, one that is infeasible, and one that is
+    not finite.
+    """
     rng, bad = (
         np.random.default_rng(0),
         {(0, 1): Status.not_steady, (1, 0): Status.infeasible, (2, 2): Status.nonfinite},
     )
     keys = [(point, seed) for point in range(6) for seed in range(3)]
     made = {key: random_replica(rng, SETTINGS, bad.get(key, Status.ok), key[0]) for key in keys}
-    return {key: one._replace(state=random_state(10 * key[0] + key[1])) for key, one in made.items()}
+    return {
+        key: one._replace(state=random_state(10 * key[0] + key[1])) for key, one in made.items()
+    }
 
 
 def of_seeds(replicas: dict[Key, Replica], first: int, count: int, **change: Any) -> xr.DataTree:
     """The map of some of the seeds."""
     settings = replace(SETTINGS, first_seed=first, seeds=count, **change)
     own = points_of_part(settings)
-    chosen = {(p, s - first): x for (p, s), x in replicas.items() if first <= s < first + count and p in own}
+    chosen = {
+        (p, s - first): x
+        for (p, s), x in replicas.items()
+        if first <= s < first + count and p in own
+    }
     return map_dataset(settings, chosen, RUN)
 
 
@@ -78,12 +88,16 @@ def test_the_files_of_parts_make_the_map_of_one_run(replicas, tmp_path: Path) ->
     assert len(bad_points(missing)["not_run"]) == len(outside)
 
 
-def test_maps_of_other_seeds_make_the_map_of_all_seeds_with_the_scatter_between_them(replicas) -> None:
+def test_maps_of_other_seeds_make_the_map_of_all_seeds_with_the_scatter_between_them(
+    replicas,
+) -> None:
     first, second = of_seeds(replicas, 0, 1), of_seeds(replicas, 1, 2)
     merged = merge_maps([second, first])
     assert_one_run(merged, of_seeds(replicas, 0, 3))
     assert merged.attrs["wall_time_seconds"] == 4.0
-    assert merged["seeds"].sizes["seed"] == 3 and not merged.force_ratio_stderr.equals(first.force_ratio_stderr)
+    assert merged["seeds"].sizes["seed"] == 3 and not merged.force_ratio_stderr.equals(
+        first.force_ratio_stderr
+    )
 
 
 def earlier(data: xr.DataTree) -> xr.DataTree:
@@ -98,12 +112,21 @@ def other_sources(data: xr.DataTree) -> xr.DataTree:
 
 
 REFUSED: dict[str, Any] = {
-    "grains is 64 in map 0 and 128 in map 1": lambda x: [of_seeds(x, 0, 1), of_seeds({}, 1, 1, grains=128)],
+    "grains is 64 in map 0 and 128 in map 1": lambda x: [
+        of_seeds(x, 0, 1),
+        of_seeds({}, 1, 1, grains=128),
+    ],
     "map 0 and map 1 have seed 1 of point 0": lambda x: [of_seeds(x, 0, 2), of_seeds(x, 1, 2)],
     "seed 1 is missing": lambda x: [of_seeds(x, 0, 1), of_seeds(x, 2, 1)],
-    "by their number of seeds": lambda x: [of_seeds(x, 0, 1, error=0.1), of_seeds(x, 1, 1, error=0.1)],
+    "by their number of seeds": lambda x: [
+        of_seeds(x, 0, 1, error=0.1),
+        of_seeds(x, 1, 1, error=0.1),
+    ],
     "version_jax is '0.1' in map 0": lambda x: [earlier(of_seeds(x, 0, 1)), of_seeds(x, 1, 1)],
-    "code_digest is 'other' in map 0": lambda x: [other_sources(of_seeds(x, 0, 1)), of_seeds(x, 1, 1)],
+    "code_digest is 'other' in map 0": lambda x: [
+        other_sources(of_seeds(x, 0, 1)),
+        of_seeds(x, 1, 1),
+    ],
     "must have the group sums": lambda x: [of_seeds({}, 0, 1)],
     "a list of at least one map": lambda _: [],
     "a list of at least one map or file, not 'map.nc'": lambda _: "map.nc",
@@ -132,7 +155,10 @@ def test_an_array_job_of_the_page_makes_the_map_of_one_process(tmp_path: Path) -
     lines = CLUSTER.read_text(encoding="utf-8").splitlines()
     task = next(line for line in lines if line.startswith("jaxgran map") and "--part" in line)
     merge = next(line for line in lines if line.startswith("jaxgran merge"))
-    tiny = "--restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 16 --seeds 1 --equilibrate 0 --strain 0.32"
+    tiny = (
+        "--restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 16 --seeds 1 --equilibrate 0 "
+        "--strain 0.32"
+    )
     task = task.replace("--preset paper", tiny).replace("$SLURM_ARRAY_TASK_COUNT", "2")
     (tmp_path / "parts").mkdir()
     for number in "12":
@@ -140,29 +166,48 @@ def test_an_array_job_of_the_page_makes_the_map_of_one_process(tmp_path: Path) -
         outcome = in_a_process(tmp_path, *words[1:])
         assert outcome.status == 3, outcome.err  # so short a preparation is not steady
         assert "not run" not in outcome.err
-    merged = in_a_process(tmp_path, *shlex.split(merge.replace("parts/*.nc", "parts/1.nc parts/2.nc"))[1:])
+    merged = in_a_process(
+        tmp_path, *shlex.split(merge.replace("parts/*.nc", "parts/1.nc parts/2.nc"))[1:]
+    )
     assert merged.status == 3 and "Force ratio" in merged.out and "not run" not in merged.err
     whole = in_a_process(tmp_path, "map", *tiny.split(), "--workers", "1", "--output", "whole.nc")
     assert whole.status == 3
     assert_one_run(open_map(tmp_path / "paper.nc"), open_map(tmp_path / "whole.nc"))
-    again = in_a_process(tmp_path, *shlex.split(merge.replace("parts/*.nc", "parts/1.nc parts/1.nc"))[1:])
+    again = in_a_process(
+        tmp_path, *shlex.split(merge.replace("parts/*.nc", "parts/1.nc parts/1.nc"))[1:]
+    )
     assert again.status == 2 and "--output 'paper.nc' already exists" in again.err
 
 
 @pytest.mark.filterwarnings("ignore::jaxgran.maps.status_report.BadPoints")
 def test_a_map_of_a_users_observable_is_merged_with_its_function() -> None:
     def observe(seen) -> dict[str, Any]:
-        return {"side": seen.state.side, "normals": (seen.contacts.normals * seen.impulses[:, None]).sum(0)}
+        return {
+            "side": seen.state.side,
+            "normals": (seen.contacts.normals * seen.impulses[:, None]).sum(0),
+        }
 
-    given: dict[str, Any] = {"grains": 16, "equilibrate": 0.0, "strain": 0.32, "observe": observe, "workers": 1}
+    given: dict[str, Any] = {
+        "grains": 16,
+        "equilibrate": 0.0,
+        "strain": 0.32,
+        "observe": observe,
+        "workers": 1,
+    }
     maps = [ratio_map([0.9], [0.5, 0.6], **given, seeds=1, first_seed=seed) for seed in (0, 1)]
-    assert_one_run(merge_maps(maps, observe=observe), ratio_map([0.9], [0.5, 0.6], **given, seeds=2))
+    assert_one_run(
+        merge_maps(maps, observe=observe), ratio_map([0.9], [0.5, 0.6], **given, seeds=2)
+    )
     for other in (None, lambda _: {"a": 1.0}):
-        with pytest.raises(InputError, match="observe must be the function of the maps, which is normals, side: "):
+        with pytest.raises(
+            InputError, match="observe must be the function of the maps, which is normals, side: "
+        ):
             merge_maps(maps, observe=other)
 
 
-def test_maps_in_double_precision_are_merged_in_it_by_a_process_that_computes_in_single(replicas) -> None:
+def test_maps_in_double_precision_are_merged_in_it_by_a_process_that_computes_in_single(
+    replicas,
+) -> None:
     parts, whole = [of_seeds(replicas, 0, 1), of_seeds(replicas, 1, 2)], of_seeds(replicas, 0, 3)
     with jax.enable_x64(False):
         merged = merge_maps(parts)
@@ -173,7 +218,9 @@ def test_maps_in_double_precision_are_merged_in_it_by_a_process_that_computes_in
 def test_maps_of_an_engine_are_merged_where_it_cannot_run(replicas, monkeypatch) -> None:
     parts = [of_seeds(replicas, 0, 1, engine=Numba()), of_seeds(replicas, 1, 2, engine=Numba())]
     whole = of_seeds(replicas, 0, 3, engine=Numba())
-    monkeypatch.setattr("jaxgran.dynamics.engine.default_device", lambda: SimpleNamespace(platform="gpu"))
+    monkeypatch.setattr(
+        "jaxgran.dynamics.engine.default_device", lambda: SimpleNamespace(platform="gpu")
+    )
     assert_one_run(merge_maps(parts), whole)
 
 
@@ -194,6 +241,8 @@ def test_statuses_of_a_map_are_read_by_the_names_that_it_has(replicas) -> None:
     data = of_seeds(replicas, 0, 3)
     status = data["seeds"].status
     renumbered = status.copy(data=np.where(status >= 2, status + 10, status))
-    renumbered.attrs["flag_values"] = np.where(status.flag_values >= 2, status.flag_values + 10, status.flag_values)
+    renumbered.attrs["flag_values"] = np.where(
+        status.flag_values >= 2, status.flag_values + 10, status.flag_values
+    )
     data["seeds"]["status"] = renumbered
     assert_one_run(merge_maps([data]), of_seeds(replicas, 0, 3))

@@ -42,7 +42,9 @@ def assert_same(ours, plain, atol: float) -> None:
     for name in TABLE:
         if name not in (*COUNTS, "unconverged", "iterations", "worst_residual", "momentum_drift"):
             expected_value = np.asarray(getattr(sums, name))
-            np.testing.assert_allclose(getattr(tally, name), expected_value, rtol=1e-6, atol=1e-9 + atol, err_msg=name)
+            np.testing.assert_allclose(
+                getattr(tally, name), expected_value, rtol=1e-6, atol=1e-9 + atol, err_msg=name
+            )
 
 
 @pytest.mark.parametrize(
@@ -84,13 +86,17 @@ def test_any_flow_takes_its_first_events_as_in_the_plain_advance(
         state = replace(state, tilt=jnp.asarray(tilt, float))
     flow = flow_of(packing_fraction, restitution=restitution, timestep=timestep)
     ours, plain = native_run(flow, state, 5), run(flow, state, 5)
-    assume(plain[1].status < Status.capacity)  # its lists are narrower: the numba engine may still hold such a flow
+    assume(
+        plain[1].status < Status.capacity
+    )  # its lists are narrower: the numba engine may still hold such a flow
     assert ours[1].status == plain[1].status
     if plain[1].status < Status.infeasible:
         assert_same(ours, plain, 1e-6 * max(1, speed))
 
 
-@pytest.mark.parametrize("rows", [10, 50])  # 100 grains, and more than the numba engine takes as they come
+@pytest.mark.parametrize(
+    "rows", [10, 50]
+)  # 100 grains, and more than the numba engine takes as they come
 def test_results_do_not_depend_on_the_order_of_the_grains(rows) -> None:
     rng, count = np.random.default_rng(rows), rows * rows
     radii = rng.uniform(0.37, 0.63, count)
@@ -106,27 +112,35 @@ def test_results_do_not_depend_on_the_order_of_the_grains(rows) -> None:
     advance = jax.jit(partial(advance_module.advance, solver=EXACT))
     shuffled = rng.permutation(count)
     after, tally = advance(flow, state, jnp.int32(100))
-    other, sums = advance(flow, jax.tree.map(lambda x: x[shuffled] if x.ndim else x, state), jnp.int32(100))
+    other, sums = advance(
+        flow, jax.tree.map(lambda x: x[shuffled] if x.ndim else x, state), jnp.int32(100)
+    )
     assert tally.collisions > count / 10
     np.testing.assert_allclose(after.velocities[shuffled], other.velocities, atol=1e-6)
     np.testing.assert_allclose(tally.contact_moment, sums.contact_moment, rtol=1e-6)
 
 
 def test_a_row_around_the_cell_comes_to_rest(native_run) -> None:
-    """Grains that touch in a closed row can only stand still relative to each other, whatever drives them together."""
+    """Grains that touch in a closed row can only stand still relative to each other, whatever
+    drives them together.
+    """
     places = np.stack([np.arange(GRAINS) + 0.5, np.full(GRAINS, GRAINS / 2)], axis=-1)
     velocities = np.zeros((GRAINS, 2))
     velocities[:, 0] = -0.1 * np.sin(2 * np.pi * np.arange(GRAINS) / GRAINS)
     grains = Grains(jnp.asarray(np.full(GRAINS, 0.5 * (1 + 1e-3))), jnp.ones(GRAINS))
     state = State(grains, *(jnp.asarray(x, float) for x in (places, velocities, GRAINS, 0.0)))
-    after, tally = native_run(flow_of(0.7, restitution=0.0, shear_rate=0.0), state, 1, BarzilaiBorwein(1e-6))
+    after, tally = native_run(
+        flow_of(0.7, restitution=0.0, shear_rate=0.0), state, 1, BarzilaiBorwein(1e-6)
+    )
     assert tally.status == Status.ok and tally.loaded_contacts >= GRAINS / 2
     np.testing.assert_allclose(after.velocities, 0, atol=1e-5)
 
 
 @pytest.mark.parametrize("heaviest", [1.0, 1e4])
 def test_stiff_clusters_are_solved_as_by_the_plain_advance(run, native_run, heaviest) -> None:
-    """One grain runs into a long row of touching ones, light and heavy in turn: sweeps alone would take thousands."""
+    """One grain runs into a long row of touching ones, light and heavy in turn: sweeps alone would
+    take thousands.
+    """
     gap = 1e-9
     places = np.stack([2 + np.arange(GRAINS) * (1 - gap), np.full(GRAINS, 30.0)], axis=-1)
     velocities = np.zeros((GRAINS, 2))
@@ -146,13 +160,24 @@ def test_steps_that_outrun_a_usual_skin_have_lists_as_wide_as_they_need(native_r
     row, rng = 6, np.random.default_rng(1)
     places = 1.05 * np.stack(np.divmod(np.arange(GRAINS), row), axis=-1) + 0.5
     grains = Grains(jnp.asarray(np.full(GRAINS, 0.5)), jnp.ones(GRAINS))
-    state = State(grains, *(jnp.asarray(x, float) for x in (places, rng.normal(size=places.shape), 1.05 * row, 0.0)))
-    assert native_run(ShearFlow(GRAINS, 0.5, 0.7, 0.05), state, 3, BarzilaiBorwein())[1].outcome == Status.deep_overlap
+    state = State(
+        grains,
+        *(jnp.asarray(x, float) for x in (places, rng.normal(size=places.shape), 1.05 * row, 0.0)),
+    )
+    assert (
+        native_run(ShearFlow(GRAINS, 0.5, 0.7, 0.05), state, 3, BarzilaiBorwein())[1].outcome
+        == Status.deep_overlap
+    )
 
 
 def test_a_solve_of_nothing_has_no_residual(native_run) -> None:
-    """Two grains that graze each other approach by rounding only, and without shear the residual has no floor."""
-    places, speeds = 5.0 * np.stack(np.divmod(np.arange(GRAINS), 6), axis=-1) + 1, np.zeros((GRAINS, 2))
+    """Two grains that graze each other approach by rounding only, and without shear the residual
+    has no floor.
+    """
+    places, speeds = (
+        5.0 * np.stack(np.divmod(np.arange(GRAINS), 6), axis=-1) + 1,
+        np.zeros((GRAINS, 2)),
+    )
     grains = Grains(jnp.asarray(np.full(GRAINS, 0.5)), jnp.ones(GRAINS))
     for angle in np.linspace(0.1, 3.0, 60):
         normal = np.array([np.cos(angle), np.sin(angle)])
@@ -188,16 +213,29 @@ def test_derivatives_are_those_of_the_engine_jax_at_the_values_of_the_engine_num
     tilt=st.sampled_from([0.0, 0.3, 1e300, np.nan]),
     shear_rate=st.sampled_from([0.0, 1.0]),
 )
-@example(place=1.0, speed=1.0, radius=0.5, mass=1.0, side=6.0, tilt=0.0, shear_rate=1.0)  # more contacts than room
-def test_senseless_states_come_to_an_end(native_run, place, speed, radius, mass, side, tilt, shear_rate) -> None:
-    """Whatever a state holds, the loop ends, and what cannot be is flagged; here that nothing is NaN and called ok."""
+@example(
+    place=1.0, speed=1.0, radius=0.5, mass=1.0, side=6.0, tilt=0.0, shear_rate=1.0
+)  # more contacts than room
+def test_senseless_states_come_to_an_end(
+    native_run, place, speed, radius, mass, side, tilt, shear_rate
+) -> None:
+    """Whatever a state holds, the loop ends, and what cannot be is flagged; here that nothing is
+    NaN and called ok.
+    """
     rng = np.random.default_rng(0)
-    arrays = (place * rng.uniform(-1, 1, (GRAINS, 2)), speed * rng.uniform(-1, 1, (GRAINS, 2)), side, tilt)
+    arrays = (
+        place * rng.uniform(-1, 1, (GRAINS, 2)),
+        speed * rng.uniform(-1, 1, (GRAINS, 2)),
+        side,
+        tilt,
+    )
     state = State(
         Grains(jnp.asarray(np.full(GRAINS, radius)), jnp.asarray(np.full(GRAINS, mass))),
         *(jnp.asarray(x, float) for x in arrays),
     )
-    after, tally = native_run(flow_of(0.6, shear_rate=shear_rate), state, 20, BarzilaiBorwein(1e-12, 100))
+    after, tally = native_run(
+        flow_of(0.6, shear_rate=shear_rate), state, 20, BarzilaiBorwein(1e-12, 100)
+    )
     if not np.all(np.isfinite(after.velocities)):
         assert tally.status == Status.nonfinite
 
@@ -210,9 +248,15 @@ def test_senseless_states_come_to_an_end(native_run, place, speed, radius, mass,
     strain=st.floats(1e-6, LIFE),
     shear_rate=st.sampled_from([1.0, 3.0]),
 )
-@example(fastest=1.0, distance=1.0, angles=(0.0, np.pi, 0.0), strain=0.01, shear_rate=1.0)  # head on
-def test_no_pair_closes_by_more_than_its_list_loses_of_the_skin(fastest, distance, angles, strain, shear_rate) -> None:
-    """Both grains fly straight in the laboratory, with the largest peculiar speed in any directions."""
+@example(
+    fastest=1.0, distance=1.0, angles=(0.0, np.pi, 0.0), strain=0.01, shear_rate=1.0
+)  # head on
+def test_no_pair_closes_by_more_than_its_list_loses_of_the_skin(
+    fastest, distance, angles, strain, shear_rate
+) -> None:
+    """Both grains fly straight in the laboratory, with the largest peculiar speed in any
+    directions.
+    """
     apart = distance * np.array([np.cos(angles[0]), np.sin(angles[0])])
     (ci, si), (cj, sj) = ((np.cos(a), np.sin(a)) for a in angles[1:])
     velocity = fastest * np.array([ci - cj, si - sj]) + [shear_rate * apart[1], 0]
@@ -223,7 +267,9 @@ def test_no_pair_closes_by_more_than_its_list_loses_of_the_skin(fastest, distanc
 
 @pytest.fixture(scope="module")
 def near_pairs_found():
-    """``find_near_pairs`` with a way in from Python; kept from run to run, as long as the numba engine is the same."""
+    """``find_near_pairs`` with a way in from Python; kept from run to run, as long as the numba
+    engine is the same.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(numba.config, "CACHE_DIR", str(object_file().with_suffix("")))
         return numba.njit(cache=True)(find_near_pairs.py_func)
@@ -237,7 +283,9 @@ def near_pairs_found():
     skin=st.floats(0.01, 1.0),
     seed=st.integers(0, 10**6),
 )
-def test_near_pairs_are_those_of_all_images(near_pairs_found, count, packing_fraction, tilt, skin, seed) -> None:
+def test_near_pairs_are_those_of_all_images(
+    near_pairs_found, count, packing_fraction, tilt, skin, seed
+) -> None:
     rng = np.random.default_rng(seed)
     radii = rng.uniform(0.37, 0.63, count)
     side = np.sqrt(np.pi * np.sum(radii**2) / packing_fraction)
@@ -247,7 +295,11 @@ def test_near_pairs_are_those_of_all_images(near_pairs_found, count, packing_fra
     motion[:, :2] = rng.uniform(0, side, (count, 2))
     motion[:, 0] -= np.floor((motion[:, 0] - tilt * motion[:, 1]) / side) * side
     room = count * (count - 1) // 2
-    cells = np.empty(max(9, 2 * count) + 1, np.uint32), *np.empty((2, count), np.uint32), np.empty((3, count))
+    cells = (
+        np.empty(max(9, 2 * count) + 1, np.uint32),
+        *np.empty((2, count), np.uint32),
+        np.empty((3, count)),
+    )
     listed = np.empty((2, room + 1), np.uint32), np.empty((2, room + 1))
     memory = layout.Pairs(*listed, *4 * [None], *cells, *3 * [None])
     grains = layout.Grains(motion, np.stack([radii, np.ones(count)], axis=-1))

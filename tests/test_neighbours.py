@@ -1,4 +1,6 @@
-"""The cell-list search finds the pairs that a search of all images finds, or says that it may have missed some."""
+"""The cell-list search finds the pairs that a search of all images finds, or says that it may have
+missed some.
+"""
 
 import jax
 import numpy as np
@@ -24,19 +26,23 @@ def search(positions, side, tilt, cutoff, capacity):
 @jax.jit
 def mapped_search(positions, side, tilt, cutoff):
     capacity = PAIRS_PER_GRAIN * positions.shape[1]
-    return lax.map(lambda replica: cell_list_pairs(*replica, capacity), (positions, side, tilt, cutoff))
+    return lax.map(
+        lambda replica: cell_list_pairs(*replica, capacity), (positions, side, tilt, cutoff)
+    )
 
 
 @jax.jit
 def batched_search(positions, side, tilt, cutoff):
     capacity = PAIRS_PER_GRAIN * positions.shape[1]
-    return jax.vmap(lambda *replica: cell_list_pairs(*replica, capacity), axis_name="jaxgran_replica")(
-        positions, side, tilt, cutoff
-    )
+    return jax.vmap(
+        lambda *replica: cell_list_pairs(*replica, capacity), axis_name="jaxgran_replica"
+    )(positions, side, tilt, cutoff)
 
 
 def flow_cell(count, packing_fraction, polydispersity=0.26):
-    """Side of the cell, and the cutoff at which a homogeneous flow fills 0.8 of the engine's buffer."""
+    """Side of the cell, and the cutoff at which a homogeneous flow fills 0.8 of the engine's
+    buffer.
+    """
     side = np.sqrt(np.pi / 4 * count * (1 + polydispersity**2 / 3) / packing_fraction)
     return side, side * np.sqrt(1.6 * PAIRS_PER_GRAIN / (np.pi * count)) + polydispersity
 
@@ -48,16 +54,27 @@ def random_positions(seed, count, side, tilt, clustered=False):
     if clustered:
         fractional[: 2 * count // 5] *= (0.25, 0.8)
         fractional += rng.random(2)
-    positions = side * np.stack([fractional[:, 0] + tilt * fractional[:, 1], fractional[:, 1]], axis=-1)
+    positions = side * np.stack(
+        [fractional[:, 0] + tilt * fractional[:, 1], fractional[:, 1]], axis=-1
+    )
     return np.asarray(wrapped(positions, side, tilt))
 
 
 def all_images(positions, side, tilt, cutoff):
     """Pairs i < j within the cutoff, by a tree of the nine nearest images."""
     positions = np.asarray(positions)
-    images = [positions + side * np.array([a + b * tilt, b]) for b in (-1, 0, 1) for a in (-2, -1, 0, 1, 2)]
+    images = [
+        positions + side * np.array([a + b * tilt, b])
+        for b in (-1, 0, 1)
+        for a in (-2, -1, 0, 1, 2)
+    ]
     near = cKDTree(np.concatenate(images)).query_ball_point(positions, cutoff)
-    return {(i, k % len(positions)) for i, found in enumerate(near) for k in found if i < k % len(positions)}
+    return {
+        (i, k % len(positions))
+        for i, found in enumerate(near)
+        for k in found
+        if i < k % len(positions)
+    }
 
 
 def found_pairs(i, j):
@@ -72,9 +89,13 @@ def found_pairs(i, j):
 @pytest.mark.parametrize("clustered", [False, True])
 def test_pairs_are_those_of_all_images(clustered):
     count = 600
-    cases = [(*flow_cell(count, fraction), tilt) for fraction in PACKING_FRACTIONS for tilt in TILTS]
+    cases = [
+        (*flow_cell(count, fraction), tilt) for fraction in PACKING_FRACTIONS for tilt in TILTS
+    ]
     side, cutoff, tilt = (np.asarray(column) for column in zip(*cases, strict=True))
-    positions = [random_positions(seed, count, s, t, clustered) for seed, (s, _, t) in enumerate(cases)]
+    positions = [
+        random_positions(seed, count, s, t, clustered) for seed, (s, _, t) in enumerate(cases)
+    ]
     expected = [all_images(r, s, t, c) for r, (s, c, t) in zip(positions, cases, strict=True)]
     for run in mapped_search, batched_search:
         i, j, missed = run(np.stack(positions), side, tilt, cutoff)
@@ -113,7 +134,10 @@ def test_single_precision_misses_nothing_but_by_rounding():
     side, cutoff = flow_cell(count, 0.82)
     positions = random_positions(3, count, side, tilt).astype(np.float32)
     i, j, missed = search(positions, side, tilt, cutoff, PAIRS_PER_GRAIN * count)
-    found, images = found_pairs(i, j), all_images(positions.astype(float), side, tilt, cutoff * (1 + 1e-4))
+    found, images = (
+        found_pairs(i, j),
+        all_images(positions.astype(float), side, tilt, cutoff * (1 + 1e-4)),
+    )
     assert not missed
     assert all_images(positions.astype(float), side, tilt, cutoff * (1 - 1e-6)) <= found <= images
 
@@ -137,7 +161,9 @@ def test_whatever_may_be_missing_is_flagged():
     assert search(positions, side, tilt, 0.13 * side, capacity)[-1], "cells smaller than the cutoff"
     assert search(positions, side, tilt, cutoff * np.nan, capacity)[-1], "no cutoff"
     assert search(positions * 0.1, side, tilt, cutoff / 50, capacity)[-1], "a cell too full"
-    assert search(positions * 0.3, side, tilt, cutoff, capacity)[-1], "more pairs than the list holds"
+    assert search(positions * 0.3, side, tilt, cutoff, capacity)[-1], (
+        "more pairs than the list holds"
+    )
 
 
 def test_set_bit_is_the_place_of_the_bit_of_that_rank():

@@ -1,4 +1,6 @@
-"""Where methods for the contact problem fail, and where they do not: laws on the collection of the benchmarks."""
+"""Where methods for the contact problem fail, and where they do not: laws on the collection of the
+benchmarks.
+"""
 
 from functools import partial
 
@@ -22,7 +24,9 @@ compiled_bound = jax.jit(spectral_bound, static_argnums=1)
 
 @pytest.fixture(scope="module")
 def networks():
-    """The quick collection without one of the flows; the others are sheared less, and compiled sooner."""
+    """The quick collection without one of the flows; the others are sheared less, and compiled
+    sooner.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "FLOWS", (module.FLOWS[0], *module.FLOWS[2:]))
         sheared = module.sheared
@@ -32,7 +36,9 @@ def networks():
 
 @pytest.fixture(scope="module")
 def feasible(networks):
-    return [network for group, members in networks.items() if group != INFEASIBLE for network in members]
+    return [
+        network for group, members in networks.items() if group != INFEASIBLE for network in members
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +48,9 @@ def solution_of():
 
     def call(network, tolerance=1e-4, max_steps=5000, method=BarzilaiBorwein):
         solver = method(tolerance, max_steps)
-        return compiled(network.contacts, network.grains, jnp.asarray(1.0), solver, jnp.asarray(True))
+        return compiled(
+            network.contacts, network.grains, jnp.asarray(1.0), solver, jnp.asarray(True)
+        )
 
     return call
 
@@ -86,7 +94,9 @@ def test_default_converges_to_the_exact_velocities(feasible, solution_of, exact_
 
 
 def test_jacobi_with_the_spectral_bound_lowers_the_objective_in_every_step(feasible, solution_of):
-    """The iteration p ← max(0, p − ω D⁻¹(W p + b)) for ω close to 2, dense; compiled, capped solves follow it."""
+    """The iteration p ← max(0, p − ω D⁻¹(W p + b)) for ω close to 2, dense; compiled, capped solves
+    follow it.
+    """
     for number, network in enumerate(feasible):
         used = np.asarray(network.contacts.used)
         matrix, approach = operator_and_approach(network)
@@ -95,19 +105,28 @@ def test_jacobi_with_the_spectral_bound_lowers_the_objective_in_every_step(feasi
         for _ in range(30):
             impulses = np.maximum(0, impulses - 1.99 * (matrix @ impulses + approach) / bound)
             objectives.append(impulses @ (matrix @ impulses / 2 + approach))
-            residuals.append(np.linalg.norm(np.minimum(np.diag(matrix) * impulses, matrix @ impulses + approach)))
+            residuals.append(
+                np.linalg.norm(np.minimum(np.diag(matrix) * impulses, matrix @ impulses + approach))
+            )
             iterates.append(impulses)
         assert np.all(np.diff(objectives) <= 1e-14 * abs(objectives[-1]))
         for cap in range(1, 31) if number % 8 == 0 else ():
-            found = np.asarray(solution_of(network, 1e-12, cap, partial(Jacobi, relaxation=1.99)).impulses)[used]
+            found = np.asarray(
+                solution_of(network, 1e-12, cap, partial(Jacobi, relaxation=1.99)).impulses
+            )[used]
             best = iterates[int(np.argmin(residuals[:cap]))]
             np.testing.assert_allclose(found, best, rtol=0, atol=1e-9 * max(np.max(best), 1e-3))
 
 
 def test_iterations_on_chains_grow_no_faster_than_their_length(solution_of):
     """A shock must travel along the chain; diffusion would take the square of the length."""
-    products = [int(solution_of(chain(discs), 1e-6, method=Nesterov).iterations) for discs in CHAINS]
+    products = [
+        int(solution_of(chain(discs), 1e-6, method=Nesterov).iterations) for discs in CHAINS
+    ]
     exponent = np.polyfit(np.log(CHAINS), np.log(products), 1)[0]
     assert exponent < 1.2
-    sweeps = [int(gauss_seidel(chain(n).contacts, chain(n).grains, 1e-6, 100_000).iterations) for n in CHAINS[:4]]
+    sweeps = [
+        int(gauss_seidel(chain(n).contacts, chain(n).grains, 1e-6, 100_000).iterations)
+        for n in CHAINS[:4]
+    ]
     assert np.polyfit(np.log(CHAINS[:4]), np.log(sweeps), 1)[0] > 1.5

@@ -1,4 +1,5 @@
-"""Notebooks are kept without outputs, as the scripts beside them say, and answer the question that they begin with.
+"""Notebooks are kept without outputs, as the scripts beside them say, and answer the question that
+they begin with.
 
 They are run by ``QUICK=1 pytest --nbmake notebooks``.
 """

@@ -34,29 +34,39 @@ def test_a_grid_of_replicas_has_the_bits_of_each_alone(flowing, threads: int) ->
     one = jax.jit(advanced)
     over_restitutions = jax.vmap(advanced, (0, None, None))
     states = jax.tree.map(lambda *x: jnp.stack(x), *map(flowing, FRACTIONS))
-    grid = jax.jit(jax.vmap(over_restitutions, (None, 0, 0)))(jnp.asarray(RESTITUTIONS), jnp.asarray(FRACTIONS), states)
+    grid = jax.jit(jax.vmap(over_restitutions, (None, 0, 0)))(
+        jnp.asarray(RESTITUTIONS), jnp.asarray(FRACTIONS), states
+    )
     for k, fraction in enumerate(FRACTIONS):
         for n, restitution in enumerate(RESTITUTIONS):
             (end, tally), alone = (
                 jax.tree.map(lambda x, p=(k, n): x[p], grid),
                 one(restitution, fraction, flowing(fraction)),
             )
-            np.testing.assert_allclose(tally.wave_kinetic, alone[1].wave_kinetic, rtol=1e-14)  # XLA's cosine of a batch
+            np.testing.assert_allclose(
+                tally.wave_kinetic, alone[1].wave_kinetic, rtol=1e-14
+            )  # XLA's cosine of a batch
             rest = end, replace(tally, wave_kinetic=alone[1].wave_kinetic)
             jax.tree.map(np.testing.assert_array_equal, rest, alone)
 
 
-def test_what_is_observed_in_a_batch_has_the_bits_of_each_replica_alone(flowing, threads: int) -> None:
+def test_what_is_observed_in_a_batch_has_the_bits_of_each_replica_alone(
+    flowing, threads: int
+) -> None:
     def coordination(snapshot):
         return jnp.sum(jnp.where(snapshot.impulses > 0, 2 / GRAINS, 0))
 
     def sampled(restitution, state):
-        return sample(ShearFlow(GRAINS, restitution, 0.7, 1e-3), state, 0.2, blocks=2, observe=coordination)
+        return sample(
+            ShearFlow(GRAINS, restitution, 0.7, 1e-3), state, 0.2, blocks=2, observe=coordination
+        )
 
     state = flowing(0.7)
     batch = jax.vmap(sampled, (0, None))(jnp.asarray(RESTITUTIONS), state)
     for n, restitution in enumerate(RESTITUTIONS):
-        np.testing.assert_array_equal(batch[1].observed_sums[n], sampled(restitution, state)[1].observed_sums)
+        np.testing.assert_array_equal(
+            batch[1].observed_sums[n], sampled(restitution, state)[1].observed_sums
+        )
 
 
 def test_a_batch_without_replicas_is_empty(flowing) -> None:
@@ -65,8 +75,11 @@ def test_a_batch_without_replicas_is_empty(flowing) -> None:
 
 
 @pytest.mark.parametrize(
-    "asked, expected", [("3", 3), ("0", usable_cores()), ("", usable_cores()), ("all", usable_cores())]
+    "asked, expected",
+    [("3", 3), ("0", usable_cores()), ("", usable_cores()), ("all", usable_cores())],
 )
-def test_the_variable_of_numba_sets_the_number_of_threads(asked: str, expected: int, monkeypatch) -> None:
+def test_the_variable_of_numba_sets_the_number_of_threads(
+    asked: str, expected: int, monkeypatch
+) -> None:
     monkeypatch.setenv("NUMBA_NUM_THREADS", asked)
     assert usable_threads() == expected

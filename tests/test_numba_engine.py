@@ -1,4 +1,6 @@
-"""The numba engine: a file for each version of its sources, and blocks of steps that are those of one call each."""
+"""The numba engine: a file for each version of its sources, and blocks of steps that are those of
+one call each.
+"""
 
 import os
 import re
@@ -27,7 +29,9 @@ PACKAGE = Path(jaxgran.__file__).parent
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
     """A folder with a copy of the package."""
-    shutil.copytree(PACKAGE, tmp_path / "copy" / "jaxgran", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        PACKAGE, tmp_path / "copy" / "jaxgran", ignore=shutil.ignore_patterns("__pycache__")
+    )
     return tmp_path / "copy"
 
 
@@ -47,7 +51,10 @@ def test_any_change_of_any_source_gives_the_machine_code_another_file(of_copy: P
         path.write_bytes(content)
     assert ffi.object_file() == kept
     compiled_here = {*(of_copy / "jaxgran" / "dynamics" / "numba_engine").glob("*.py")}
-    imported = {of_copy / "jaxgran" / name for name in ("contact/law.py", "model/status.py", "dynamics/tally.py")}
+    imported = {
+        of_copy / "jaxgran" / name
+        for name in ("contact/law.py", "model/status.py", "dynamics/tally.py")
+    }
     assert compiled_here and compiled_here | imported <= set(sources)
 
 
@@ -86,8 +93,12 @@ def test_only_some_files_are_kept_and_the_oldest_go(tmp_path: Path) -> None:
 
 
 def words(structure: str) -> dict[str, int]:
-    """Offset of each field of a structure of XLA's C interface in words, as the header of this jaxlib has it."""
-    header = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text(encoding="utf-8")
+    """Offset of each field of a structure of XLA's C interface in words, as the header of this
+    jaxlib has it.
+    """
+    header = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text(
+        encoding="utf-8"
+    )
     header = re.sub(r"//.*", "", header)
     body = re.search(rf"struct {structure} {{(.*?)}}", header, re.DOTALL)
     offset, found = 0, {}
@@ -103,11 +114,15 @@ def test_the_handler_reads_the_call_frame_where_this_jaxlib_has_it() -> None:
     assert frame["extension_start"] == handler.EXTENSION_START
     assert frame["args"] + words("XLA_FFI_Args")["args"] == handler.ARGS
     assert frame["rets"] + words("XLA_FFI_Rets")["rets"] == handler.RETS
-    assert (buffer["data"], buffer["rank"], buffer["dims"]) == (handler.DATA, handler.RANK, handler.DIMS)
-    assert words("XLA_FFI_Metadata_Extension")["metadata"] == handler.METADATA
-    assert words("XLA_FFI_Metadata")["api_version"] + words("XLA_FFI_Api_Version")["major_version"] == (
-        handler.API_VERSION
+    assert (buffer["data"], buffer["rank"], buffer["dims"]) == (
+        handler.DATA,
+        handler.RANK,
+        handler.DIMS,
     )
+    assert words("XLA_FFI_Metadata_Extension")["metadata"] == handler.METADATA
+    assert words("XLA_FFI_Metadata")["api_version"] + words("XLA_FFI_Api_Version")[
+        "major_version"
+    ] == (handler.API_VERSION)
 
 
 def test_a_jaxlib_that_refuses_the_version_of_the_handler_is_an_input_error(monkeypatch) -> None:
@@ -115,13 +130,17 @@ def test_a_jaxlib_that_refuses_the_version_of_the_handler_is_an_input_error(monk
         raise jax.errors.JaxRuntimeError(f"handler registration for {name} failed")
 
     monkeypatch.setattr(jax.ffi, "register_ffi_target", refuse)
-    with pytest.raises(InputError, match=f"engine must be jax with jaxlib {jaxlib.__version__}, not numba: handler"):
+    with pytest.raises(
+        InputError, match=f"engine must be jax with jaxlib {jaxlib.__version__}, not numba: handler"
+    ):
         ffi._register.__wrapped__()
 
 
 @pytest.mark.parametrize("packing_fraction", [0.6, 0.8])
 def test_blocks_of_one_call_are_those_of_one_call_each(flowing, packing_fraction: float) -> None:
-    """Up to rounding, as the list of near pairs lasts longer than a block; one block has no step."""
+    """Up to rounding, as the list of near pairs lasts longer than a block; one block has no
+    step.
+    """
     flow, state = ShearFlow(GRAINS, 0.6, packing_fraction, 1e-3), flowing(packing_fraction)
     steps = jnp.asarray([20, 0, 1, 7, 30, 12])
     end, tallies = advance_blocks(flow, Numerics(engine=Numba()), state, steps)
@@ -129,6 +148,8 @@ def test_blocks_of_one_call_are_those_of_one_call_each(flowing, packing_fraction
         state, tally = advance(flow, state, count, engine=Numba())
         for name in TABLE:
             values = getattr(tallies, name)[k], getattr(tally, name)
-            np.testing.assert_allclose(*values, rtol=1e-8, atol=1e-9, err_msg=f"{name} of block {k}")
+            np.testing.assert_allclose(
+                *values, rtol=1e-8, atol=1e-9, err_msg=f"{name} of block {k}"
+            )
     np.testing.assert_allclose(end.velocities, state.velocities, rtol=1e-8, atol=1e-9)
     assert float(tallies.collisions.sum()) > 10 and np.all(tallies.wave_kinetic[steps > 0] > 0)

@@ -13,7 +13,9 @@ GRAINS, AREA, SHEAR_RATE, TIMESTEP = 20, 31.0, 2.0, 1e-2
 
 @pytest.fixture(scope="module")
 def microscopic() -> dict[str, list[np.ndarray]]:
-    """Contacts of a few time steps, a list of arrays over the contacts of each, and the velocities of each."""
+    """Contacts of a few time steps, a list of arrays over the contacts of each, and the velocities
+    of each.
+    """
     rng = np.random.default_rng(0)
     counts = [7, 0, 5, 9, 0, 0, 3]
     return {
@@ -36,7 +38,9 @@ def tally(microscopic) -> Tally:
         return total
 
     masses = microscopic["masses"][0]
-    kinetic = sum(np.einsum("i,ia,ib->ab", masses, c, c) * TIMESTEP for c in microscopic["velocities"])
+    kinetic = sum(
+        np.einsum("i,ia,ib->ab", masses, c, c) * TIMESTEP for c in microscopic["velocities"]
+    )
     impulses, binary = (np.concatenate(microscopic[name]) for name in ("impulses", "binary"))
     steps = len(microscopic["impulses"])
     return Tally(
@@ -86,14 +90,18 @@ def stress_over_steps(microscopic, impulses: str) -> np.ndarray:
 
 
 def test_the_force_ratio_is_that_of_the_means_over_contacts(microscopic, measured) -> None:
-    forces, binary = (np.concatenate(microscopic[name]) / TIMESTEP for name in ("impulses", "binary"))
+    forces, binary = (
+        np.concatenate(microscopic[name]) / TIMESTEP for name in ("impulses", "binary")
+    )
     assert measured["force_ratio"] == pytest.approx(forces.mean() / binary.mean())
 
 
 def test_stresses_are_time_averages_over_the_cell(microscopic, measured) -> None:
     contact, binary = (stress_over_steps(microscopic, name) for name in ("impulses", "binary"))
     masses = microscopic["masses"][0]
-    kinetic = np.mean([(masses[:, None] * c).T @ c / AREA for c in microscopic["velocities"]], axis=0)
+    kinetic = np.mean(
+        [(masses[:, None] * c).T @ c / AREA for c in microscopic["velocities"]], axis=0
+    )
     for name, stress in (("contact", contact), ("binary", binary), ("kinetic", kinetic)):
         np.testing.assert_allclose(measured[f"{name}_stress"], stress, rtol=1e-12)
     total = contact + kinetic
@@ -117,9 +125,13 @@ def test_temperature_is_kinetic_energy_over_2n(microscopic, measured) -> None:
 
 def test_counts_are_per_grain_and_step(microscopic, measured, tally) -> None:
     impulses, binary = microscopic["impulses"], microscopic["binary"]
-    assert measured["coordination_number"] == pytest.approx(np.mean([2 * np.sum(p > 0) / GRAINS for p in impulses]))
+    assert measured["coordination_number"] == pytest.approx(
+        np.mean([2 * np.sum(p > 0) / GRAINS for p in impulses])
+    )
     strain = SHEAR_RATE * TIMESTEP * len(impulses)
-    assert measured["collision_rate"] == pytest.approx(2 * np.sum(np.concatenate(binary) > 0) / GRAINS / strain)
+    assert measured["collision_rate"] == pytest.approx(
+        2 * np.sum(np.concatenate(binary) > 0) / GRAINS / strain
+    )
     assert measured["iterations"] == 6.0
     assert measured["unconverged_share"] == 0.25
     assert measured["mean_overlap"] == pytest.approx(6e-3 / sum(len(p) for p in impulses))

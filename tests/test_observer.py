@@ -1,4 +1,6 @@
-"""Observables of one's own: every time step counts once, forces exactly, and looking changes nothing."""
+"""Observables of one's own: every time step counts once, forces exactly, and looking changes
+nothing.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -66,10 +68,14 @@ def test_every_step_counts_once_in_every_block(observed) -> None:
 
 
 def test_forces_are_averaged_exactly(observed, plain_sample) -> None:
-    """The stress of the contacts, their number and their errors are the engine's own, to rounding."""
+    """The stress of the contacts, their number and their errors are the engine's own, to
+    rounding.
+    """
     means, errors = observed[1].observed()
     np.testing.assert_allclose(means["stress"], plain_sample[1].contact_stress, rtol=1e-12)
-    np.testing.assert_allclose(errors["stress"], plain_sample[1].errors()["contact_stress"], rtol=1e-9)
+    np.testing.assert_allclose(
+        errors["stress"], plain_sample[1].errors()["contact_stress"], rtol=1e-9
+    )
     assert 2 * means["pushes"] / GRAINS == pytest.approx(
         float(plain_sample[1].averages["coordination_number"]), rel=1e-12
     )
@@ -79,19 +85,25 @@ def test_velocities_are_averaged_up_to_the_strain_of_a_flight(observed, plain_sa
     # at the beginning of a flight of strain γ, T is too small by γ |T_xy| / 2, with |T_xy| < T
     means, _ = observed[1].observed()
     flight = STRAIN / float(jnp.sum(plain_sample[1].tally.solves))
-    assert means["temperature"] == pytest.approx(float(plain_sample[1].granular_temperature), rel=2 * flight)
+    assert means["temperature"] == pytest.approx(
+        float(plain_sample[1].granular_temperature), rel=2 * flight
+    )
 
 
 def test_error_of_a_ratio_is_that_of_the_ratio(observed) -> None:
     length, error = observed[1].observed(lambda mean: {"length": mean["length"] / mean["pushes"]})
     sums = observed[1].observed_sums
-    assert length["length"] == pytest.approx(float(jnp.sum(sums["length"]) / jnp.sum(sums["pushes"])))
+    assert length["length"] == pytest.approx(
+        float(jnp.sum(sums["length"]) / jnp.sum(sums["pushes"]))
+    )
     assert 0.9 < length["length"] < 1.1
     assert 0 < error["length"] < 0.05
 
 
 def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monkeypatch) -> None:
-    """With room for three, the numba engine is suspended after every other step with contacts, and takes none twice."""
+    """With room for three, the numba engine is suspended after every other step with contacts, and
+    takes none twice.
+    """
     monkeypatch.setattr(observed_advance, "_MOST_ROOM", 3)
     steps = jnp.int32(320)
     observing = jax.jit(lambda state: advance_observed(FLOW, Numerics(), state, steps, all_of_step))
@@ -100,19 +112,29 @@ def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monke
     jax.tree.map(np.testing.assert_array_equal, (state, tally), plain)
     assert tally.solves == jnp.sum(observed[1].tally.solves) > 50
     assert own["one"] == own["inside"] == tally.steps == 320
-    np.testing.assert_allclose(own["stress"] * FLOW.timestep * state.side**2, tally.contact_moment, rtol=1e-12)
-    assert own["temperature"] == pytest.approx(float(jnp.sum(observed[1].observed_sums["temperature"])), rel=1e-3)
+    np.testing.assert_allclose(
+        own["stress"] * FLOW.timestep * state.side**2, tally.contact_moment, rtol=1e-12
+    )
+    assert own["temperature"] == pytest.approx(
+        float(jnp.sum(observed[1].observed_sums["temperature"])), rel=1e-3
+    )
 
 
 def test_engine_jax_observes_the_same(flowing, run) -> None:
     numerics, state, steps = Numerics(engine=Jax()), flowing(0.7), jnp.int32(200)
-    end, tally, own = jax.jit(lambda state: advance_observed(FLOW, numerics, state, steps, all_of_step))(state)
+    end, tally, own = jax.jit(
+        lambda state: advance_observed(FLOW, numerics, state, steps, all_of_step)
+    )(state)
     plain_end, plain_tally = run(FLOW, state, 200, solver=BarzilaiBorwein())
     np.testing.assert_allclose(end.velocities, plain_end.velocities, atol=1e-9)
     assert tally.solves == plain_tally.solves > 20
     assert own["one"] == own["inside"] == 200
-    np.testing.assert_allclose(own["stress"] * FLOW.timestep * state.side**2, tally.contact_moment, rtol=1e-12)
-    _, _, recorded = jax.jit(lambda state: advance_observed(FLOW, Numerics(), state, steps, all_of_step))(state)
+    np.testing.assert_allclose(
+        own["stress"] * FLOW.timestep * state.side**2, tally.contact_moment, rtol=1e-12
+    )
+    _, _, recorded = jax.jit(
+        lambda state: advance_observed(FLOW, Numerics(), state, steps, all_of_step)
+    )(state)
     assert own.keys() == recorded.keys()
     for name in own:
         np.testing.assert_allclose(own[name], recorded[name], rtol=1e-3, atol=1e-3, err_msg=name)
@@ -122,7 +144,9 @@ def test_what_is_observed_may_depend_on_what_is_differentiated(flowing) -> None:
     """The sums are then those of the engine "jax", which derivatives go through."""
 
     def found(scale):
-        _, measured = sample(FLOW, flowing(0.7), STRAIN, observe=lambda seen: scale * jnp.sum(seen.impulses))
+        _, measured = sample(
+            FLOW, flowing(0.7), STRAIN, observe=lambda seen: scale * jnp.sum(seen.impulses)
+        )
         return measured.observed_sums
 
     primals, tangents = jax.eval_shape(lambda scale: jax.jvp(found, (scale,), (1.0,)), 2.0)

@@ -1,10 +1,19 @@
-"""Nothing that took time is replaced by something else: it is refused in a sentence, until --overwrite is given."""
+"""Nothing that took time is replaced by something else: it is refused in a sentence, until
+--overwrite is given.
+"""
 
 import shutil
 from pathlib import Path
 
 import pytest
-from command_line import POINTS, assert_one_sentence, files, jaxgran, made_up_replicas, write_few_variables
+from command_line import (
+    POINTS,
+    assert_one_sentence,
+    files,
+    jaxgran,
+    made_up_replicas,
+    write_few_variables,
+)
 from drawn import write_without_drawing
 
 from jaxgran.io.atomic import read_arrays
@@ -50,7 +59,9 @@ def finished(original: Path, tmp_path: Path) -> bytes:
     return (tmp_path / "jaxgran_map.nc").read_bytes()
 
 
-def test_a_map_of_other_parameters_is_refused_and_the_first_of_them_named(finished: bytes, tmp_path: Path) -> None:
+def test_a_map_of_other_parameters_is_refused_and_the_first_of_them_named(
+    finished: bytes, tmp_path: Path
+) -> None:
     for name in ("timestep", "notes"):  # a picture of an earlier map, and one of the user's
         (tmp_path / f"jaxgran_map_{name}.png").touch()
     before = files(tmp_path)
@@ -60,7 +71,9 @@ def test_a_map_of_other_parameters_is_refused_and_the_first_of_them_named(finish
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished and files(tmp_path) == before
     assert jaxgran(tmp_path, *MAP, "--grains", "64", "--overwrite").status == 0
     assert open_map(tmp_path / "jaxgran_map.nc").attrs["grains"] == 64
-    assert "jaxgran_map_timestep.png" not in files(tmp_path) and "jaxgran_map_notes.png" in files(tmp_path)
+    assert "jaxgran_map_timestep.png" not in files(tmp_path) and "jaxgran_map_notes.png" in files(
+        tmp_path
+    )
 
 
 def test_what_is_no_map_is_not_replaced(tmp_path: Path) -> None:
@@ -70,25 +83,34 @@ def test_what_is_no_map_is_not_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == b"years of work"
 
 
-def test_a_finished_map_is_taken_from_its_file_by_resume(finished: bytes, tmp_path: Path, monkeypatch) -> None:
+def test_a_finished_map_is_taken_from_its_file_by_resume(
+    finished: bytes, tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.setattr(ratio_map_module, "run_replicas", None)  # nothing is run
     (tmp_path / "jaxgran_map_curves.png").unlink()
     outcome = jaxgran(tmp_path, *MAP, "--resume")
     assert outcome.status == 0
     assert "jaxgran_map.nc is finished and is read from its file." in outcome.err
-    assert "wrote jaxgran_map_curves.png" in outcome.err and "wrote jaxgran_map.nc" not in outcome.err
+    assert (
+        "wrote jaxgran_map_curves.png" in outcome.err and "wrote jaxgran_map.nc" not in outcome.err
+    )
     assert "Force ratio" in outcome.out
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
     assert_one_sentence(jaxgran(tmp_path, *MAP, "--resume", "--grains", "64"))
 
 
-def test_an_interrupted_map_does_not_replace_a_finished_one(finished: bytes, tmp_path: Path, monkeypatch) -> None:
+def test_an_interrupted_map_does_not_replace_a_finished_one(
+    finished: bytes, tmp_path: Path, monkeypatch
+) -> None:
     half = dict(list(BOTH.items())[:1])
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(half, KeyboardInterrupt))
     for words in ([], ["--grains", "64", "--overwrite"]):
         outcome = jaxgran(tmp_path, *MAP, *words)
         assert outcome.status == 130
-        assert "1 points missing; finished points are saved" in outcome.err and "wrote" not in outcome.err
+        assert (
+            "1 points missing; finished points are saved" in outcome.err
+            and "wrote" not in outcome.err
+        )
         assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
         unfinished = tmp_path / "jaxgran_map.nc.unfinished"
         assert len(read_arrays(unfinished / "map.nc")[0]["keys"]) == 1
@@ -108,17 +130,24 @@ def test_plot_and_a_map_without_overwrite_remove_nothing(finished: bytes, tmp_pa
 
 
 @pytest.mark.parametrize("command", ["map", "merge"])
-def test_a_new_map_replaces_no_file_by_a_figure(finished: bytes, command: str, tmp_path: Path, monkeypatch) -> None:
+def test_a_new_map_replaces_no_file_by_a_figure(
+    finished: bytes, command: str, tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.setattr("jaxgran.maps.merge.merge_maps", lambda paths: open_map(paths[0]))
     (tmp_path / "ratio_theory.png").write_bytes(b"by hand")
     before = files(tmp_path)
     words = MAP if command == "map" else ("merge", "jaxgran_map.nc")
     outcome = jaxgran(tmp_path, *words, "--output", "ratio.nc")
     assert_one_sentence(outcome)
-    assert "the figure 'ratio_theory.png' already exists; pass --overwrite to replace it" in outcome.err
+    assert (
+        "the figure 'ratio_theory.png' already exists; pass --overwrite to replace it"
+        in outcome.err
+    )
     assert files(tmp_path) == before and (tmp_path / "ratio_theory.png").read_bytes() == b"by hand"
     assert jaxgran(tmp_path, *words, "--output", "ratio.nc", "--overwrite").status == 0
-    assert (tmp_path / "ratio_theory.png").read_bytes() == b"by hand"  # a line of points has no such figure
+    assert (
+        tmp_path / "ratio_theory.png"
+    ).read_bytes() == b"by hand"  # a line of points has no such figure
 
 
 def test_pages_are_replaced_by_those_of_the_same_map_alone(finished: bytes, tmp_path: Path) -> None:
@@ -131,13 +160,28 @@ def test_pages_are_replaced_by_those_of_the_same_map_alone(finished: bytes, tmp_
         page.write_bytes(content)
         outcome = jaxgran(tmp_path, "explore", "other.nc", "--output", page.name)
         assert_one_sentence(outcome)
-        assert "--output 'jaxgran_map.html' already exists and belongs to another map; pass --overwrite" in outcome.err
+        assert (
+            "--output 'jaxgran_map.html' already exists and belongs to another map; pass "
+            "--overwrite" in outcome.err
+        )
         assert page.read_bytes() == content
-    assert jaxgran(tmp_path, "explore", "other.nc", "--output", page.name, "--overwrite").status == 0
+    assert (
+        jaxgran(tmp_path, "explore", "other.nc", "--output", page.name, "--overwrite").status == 0
+    )
     assert page.read_bytes() not in (first, b"")
 
 
-RUN = ("run", "--restitution", "0.5", "--packing-fraction", "0.6", "--grains", "32", "--output", "flow.nc")
+RUN = (
+    "run",
+    "--restitution",
+    "0.5",
+    "--packing-fraction",
+    "0.6",
+    "--grains",
+    "32",
+    "--output",
+    "flow.nc",
+)
 
 
 @pytest.mark.parametrize("option", ["trajectory", "movie"])

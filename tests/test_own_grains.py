@@ -1,4 +1,6 @@
-"""Any sizes and masses: packed without overlap, no contact missed, heated as theory says; masses are but a unit."""
+"""Any sizes and masses: packed without overlap, no contact missed, heated as theory says; masses
+are but a unit.
+"""
 
 import re
 from dataclasses import replace
@@ -39,7 +41,9 @@ def flow_of(packing_fraction: float = 0.7, **change) -> ShearFlow:
 
 @pytest.fixture(scope="module")
 def packed_own():
-    """``packed_own(law, packing_fraction)``: a packing at rest; ``packed_own.compiled`` is ``pack``."""
+    """``packed_own(law, packing_fraction)``: a packing at rest; ``packed_own.compiled`` is
+    ``pack``.
+    """
     compiled = jax.jit(pack)
 
     @cache
@@ -54,7 +58,9 @@ def packed_own():
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("packing_fraction", [0.2, 0.8])
-def test_packing_has_the_grains_no_overlap_and_the_packing_fraction(packed_own, law, packing_fraction):
+def test_packing_has_the_grains_no_overlap_and_the_packing_fraction(
+    packed_own, law, packing_fraction
+):
     state = packed_own(law, packing_fraction)
     side, radii = float(state.side), np.asarray(state.grains.radii)
     np.testing.assert_allclose(2 * radii, LAWS[law] / LAWS[law].mean(), rtol=1e-14)
@@ -68,20 +74,28 @@ def test_a_flow_stays_apart_conserves_momentum_and_balances_its_energy(packed_ow
     masses = np.where(EVEN, 3.0, 0.05)  # small and heavy, large and hollow
     velocities = rng.normal(size=(GRAINS, 2)) / np.sqrt(masses)[:, None]
     velocities -= masses @ velocities / masses.sum()
-    start = replace(state, grains=Grains(state.grains.radii, jnp.asarray(masses)), velocities=jnp.asarray(velocities))
+    start = replace(
+        state,
+        grains=Grains(state.grains.radii, jnp.asarray(masses)),
+        velocities=jnp.asarray(velocities),
+    )
     end, tally = run(flow_of(0.8, timestep=1e-4), start, 2000)
     gaps = gaps_of(end.positions, end.grains.radii, float(end.side), float(end.tilt))
     assert np.min(gaps) > -1e-2 and tally.collisions > 100
     assert tally.status in (Status.ok, Status.iteration_limit)
     assert tally.momentum_drift < 1e-12
     work = -tally.contact_moment[0, 1] - tally.kinetic_moment[0, 1]
-    assert work - tally.dissipation == pytest.approx(float(tally.energy_change), abs=1e-9 * float(tally.dissipation))
+    assert work - tally.dissipation == pytest.approx(
+        float(tally.energy_change), abs=1e-9 * float(tally.dissipation)
+    )
 
 
 def test_masses_are_a_unit(packed_own, run):
     """Twice the masses: the same motion to the bit, and twice the impulses."""
     state = packed_own("1 to 3", 0.8)
-    state = replace(state, velocities=jnp.asarray(np.random.default_rng(2).normal(size=(GRAINS, 2))))
+    state = replace(
+        state, velocities=jnp.asarray(np.random.default_rng(2).normal(size=(GRAINS, 2)))
+    )
     heavy = replace(state, grains=Grains(state.grains.radii, 2 * state.grains.masses))
     (end, tally), (heavy_end, heavy_tally) = (run(flow_of(0.8), one, 500) for one in (state, heavy))
     np.testing.assert_array_equal(heavy_end.positions, end.positions)
@@ -98,7 +112,9 @@ def test_a_small_heavy_disc_throws_a_large_hollow_one(run, scene):
     after, tally = run(flow_of(0.02), before, 1)
     laboratory = np.asarray(after.velocities)[:2, 0] + 4.0
     centre = 6.0 / 3.5  # u⁺ = −α u⁻ about the centre of mass
-    np.testing.assert_allclose(laboratory, [centre - 0.6 * 0.5 / 3.5 * 2, centre + 0.6 * 3.0 / 3.5 * 2], rtol=1e-12)
+    np.testing.assert_allclose(
+        laboratory, [centre - 0.6 * 0.5 / 3.5 * 2, centre + 0.6 * 3.0 / 3.5 * 2], rtol=1e-12
+    )
     assert tally.collisions == 1
 
 
@@ -121,7 +137,9 @@ def test_start_and_prepare_keep_the_grains_and_heat_them_alike():
 
 
 def test_theory_of_given_grains_is_that_of_their_law():
-    """Eight classes of uniform diameters stand for the law as its quadrature does; masses are a unit."""
+    """Eight classes of uniform diameters stand for the law as its quadrature does; masses are a
+    unit.
+    """
     grains = polydisperse(256, 0.26, jax.random.key(0))
     diameters, masses = size_classes(grains)
     given = mixture_moments(0.8, 0.6, 1.0, diameters, masses)
@@ -143,7 +161,9 @@ def test_cell_lists_of_unlike_grains_are_complete_or_flagged():
         hood = build(jnp.asarray(positions), grains, jnp.asarray(side), jnp.asarray(0.3))
         for listed in (hood.outer, hood.near):
             assert not listed.overflow and listed.skin > 0.05
-            assert pairs_within(float(listed.skin) - 1e-12, positions, radii, side, 0.3) == listed_pairs(listed)
+            assert pairs_within(
+                float(listed.skin) - 1e-12, positions, radii, side, 0.3
+            ) == listed_pairs(listed)
 
 
 def test_a_packing_of_grains_too_large_for_the_cell_is_not_found_where_they_are_traced(packed_own):
@@ -154,7 +174,9 @@ def test_a_packing_of_grains_too_large_for_the_cell_is_not_found_where_they_are_
 
 
 @pytest.mark.parametrize("count", [256, 1000])
-def test_a_grain_too_large_for_the_lists_is_refused_and_the_limit_stated_is_one_that_is_accepted(count):
+def test_a_grain_too_large_for_the_lists_is_refused_and_the_limit_stated_is_one_that_is_accepted(
+    count,
+):
     def with_one(diameter: float) -> Grains:
         return own_grains(np.append(np.ones(count - 1), diameter))
 
@@ -166,7 +188,10 @@ def test_a_grain_too_large_for_the_lists_is_refused_and_the_limit_stated_is_one_
     with refused("the largest diameter must be at most") as caught:
         require_room(flow, with_one(30.0))
     limit = float(re.search(r"at most ([\d.]+) times", str(caught.value))[1])
-    below = max((with_one(d) for d in np.arange(1.0, 30.0, 0.1) if relative(with_one(d)) < 0.95 * limit), key=relative)
+    below = max(
+        (with_one(d) for d in np.arange(1.0, 30.0, 0.1) if relative(with_one(d)) < 0.95 * limit),
+        key=relative,
+    )
     require_room(flow, below)
     assert relative(below) > 0.8 * limit
     side = cell_side(below.radii, flow.packing_fraction)

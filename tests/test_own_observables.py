@@ -24,7 +24,8 @@ MAP: dict[str, Any] = {
     "grains": GRAINS,
     "seeds": 2,
     "equilibrate": 0.5,
-    "strain": 3.2,  # blocks of 100 time steps: more steps with contacts than the numba engine records in a call
+    # blocks of 100 time steps: more steps with contacts than the numba engine records in a call
+    "strain": 3.2,
 }
 pytestmark = pytest.mark.filterwarnings("ignore::jaxgran.maps.status_report.BadPoints")
 
@@ -34,7 +35,8 @@ def observe(seen) -> dict:
     forces = seen.impulses / seen.timestep
     return {
         "contacts_per_grain": 2 * jnp.sum(pushes) / GRAINS,
-        "own_stress": jnp.einsum("c,ca,cb->ab", forces * seen.contacts.distances, n, n) / seen.state.side**2,
+        "own_stress": jnp.einsum("c,ca,cb->ab", forces * seen.contacts.distances, n, n)
+        / seen.state.side**2,
     }
 
 
@@ -66,7 +68,9 @@ def test_variables_have_the_dimensions_of_what_is_returned(observed) -> None:
     assert observed.own_stress.dims == (*point, "own_stress_dim_0", "own_stress_dim_1")
     assert "units" not in observed.own_stress.attrs
     interval = observed.contacts_per_grain_ci95
-    np.testing.assert_allclose(interval.sel(error_source="sampling"), 1.96 * observed.contacts_per_grain_stderr)
+    np.testing.assert_allclose(
+        interval.sel(error_source="sampling"), 1.96 * observed.contacts_per_grain_stderr
+    )
     assert interval.sel(error_source=["total", "timestep", "size", "tolerance"]).isnull().all()
 
 
@@ -88,17 +92,25 @@ def test_an_unfinished_map_goes_on_to_the_same_bits_with_the_same_function_only(
     with pytest.raises(RuntimeError, match="cut off"):
         ratio_map(**MAP, observe=observe, output=output, progress=cut_off, workers=1)
     assert len(read_arrays(folder / "map.nc")[0]["keys"]) and list(folder.glob("journal-*"))
-    for other in (None, lambda seen: {**observe(seen), "contacts_per_grain": jnp.sum(seen.impulses > 0) / GRAINS}):
+    for other in (
+        None,
+        lambda seen: {**observe(seen), "contacts_per_grain": jnp.sum(seen.impulses > 0) / GRAINS},
+    ):
         with refused(r"has observe 'contacts_per_grain, own_stress: \w{16}', not "):
             ratio_map(**MAP, observe=other, output=output, resume=True)
     steps: list[float] = []
-    data = ratio_map(**MAP, observe=lambda seen: observe(seen), output=output, resume=True, progress=steps.append)
+    data = ratio_map(
+        **MAP, observe=lambda seen: observe(seen), output=output, resume=True, progress=steps.append
+    )
     sample_and_before = 2 * 4 * (3.2 + 0.5) / 1e-3
     assert sum(steps) < 0.4 * sample_and_before
     assert_same_variables(data, observed)
     assert_same_variables(open_map(output), observed)
     assert_same_variables(ratio_map(**MAP, observe=observe, output=output, resume=True), observed)
-    with pytest.raises(InputError, match=r"has a map with observe 'contacts_per_grain, own_stress: .*' and not None"):
+    with pytest.raises(
+        InputError,
+        match=r"has a map with observe 'contacts_per_grain, own_stress: .*' and not None",
+    ):
         ratio_map(**MAP, output=output, resume=True)
     with refused("must be a function that is passed to `ratio_map`"):
         MapSettings(**choices_of(data))

@@ -10,12 +10,17 @@ import jaxgran
 
 
 def run_python(code: str) -> str:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
 
 
 def test_import_is_light() -> None:
     heavy = ("jax", "jax_md", "xarray", "matplotlib", "typer", "numpy")
-    assert run_python(f"import sys, jaxgran; print([name for name in {heavy} if name in sys.modules])") == "[]\n"
+    assert (
+        run_python(f"import sys, jaxgran; print([name for name in {heavy} if name in sys.modules])")
+        == "[]\n"
+    )
 
 
 def test_import_starts_no_backend_and_changes_no_flag_of_jax() -> None:
@@ -36,11 +41,15 @@ print(xla_bridge.backends_are_initialized(), jax.config.jax_enable_x64, changed)
 def test_public_names_resolve_and_are_documented() -> None:
     assert {*jaxgran.__all__} <= {*dir(jaxgran)}
     for name in jaxgran.__all__:
-        assert getattr(jaxgran, name).__doc__ and getattr(jaxgran, name).__module__.startswith("jaxgran."), name
+        assert getattr(jaxgran, name).__doc__ and getattr(jaxgran, name).__module__.startswith(
+            "jaxgran."
+        ), name
 
 
 def test_editors_know_the_names_without_running_them(tmp_path: Path) -> None:
-    """Types of public names, of the averages of a sample and of a snapshot in a series, by the stub alone."""
+    """Types of public names, of the averages of a sample and of a snapshot in a series, by the stub
+    alone.
+    """
     code = """
 import jaxgran as jg
 def typed(flow: jg.ShearFlow, sample: jg.Sample, series: jg.Snapshot) -> None:
@@ -55,7 +64,10 @@ def typed(flow: jg.ShearFlow, sample: jg.Sample, series: jg.Snapshot) -> None:
     command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "typed.py"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     types = re.findall(r'Type of ".*" is "(.*)"', done.stdout)
-    assert types[0].startswith("(flow: ShearFlow, key: ") and types[1::2] == ["ShearFlow", "Snapshot"]
+    assert types[0].startswith("(flow: ShearFlow, key: ") and types[1::2] == [
+        "ShearFlow",
+        "Snapshot",
+    ]
     assert types[2].startswith("Array | ndarray")
     assert [x for x in ("presure", "smaple") if f'"{x}" is' in done.stdout] == ["presure", "smaple"]
 

@@ -43,22 +43,32 @@ def assert_same_numbers(shown: list, expected: np.ndarray) -> None:
 
 
 def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
-    data, by_name = flattened(page_map()).sortby("timestep"), {one["name"]: one for one in found["observables"]}
+    data, by_name = (
+        flattened(page_map()).sortby("timestep"),
+        {one["name"]: one for one in found["observables"]},
+    )
     dims = ("timestep", "packing_fraction", "restitution")
     strain = data["seeds/strain"].sum("seed")
     for name, observable in OBSERVABLES.items():
         if observable.tensor:
             for a, b in np.ndindex(2, 2):
                 assert_same_numbers(
-                    by_name[f"{name}_{'xy'[a]}{'xy'[b]}"]["value"], data[path_of(name)].values[..., a, b]
+                    by_name[f"{name}_{'xy'[a]}{'xy'[b]}"]["value"],
+                    data[path_of(name)].values[..., a, b],
                 )
             continue
         one = by_name[name]
-        assert one["meaning"] == observable.meaning and (observable.unit == "1") == (one["unit"] == "")
+        assert one["meaning"] == observable.meaning and (observable.unit == "1") == (
+            one["unit"] == ""
+        )
         assert_same_numbers(one["value"], data[path_of(name)].transpose(*dims).values)
         if observable.group != "diagnostics":
-            assert_same_numbers(one["error"], data[f"{path_of(name)}_stderr"].transpose(*dims).values)
-        assert ("theory" in one) == (f"theory/{name}" in data) and ("whole" in one) == (f"{name}_ci95" in data)
+            assert_same_numbers(
+                one["error"], data[f"{path_of(name)}_stderr"].transpose(*dims).values
+            )
+        assert ("theory" in one) == (f"theory/{name}" in data) and ("whole" in one) == (
+            f"{name}_ci95" in data
+        )
         if "theory" in one:
             assert_same_numbers(one["theory"], data[f"theory/{name}"].values)
         if "whole" in one:
@@ -68,7 +78,12 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
             assert_same_numbers(one["samples"], (strain / correlated).values)
     ratio = data.force_ratio.transpose(*dims).values
     assert_same_numbers(by_name["excess"]["value"], ratio - 1)
-    assert [axis["values"] for axis in found["axes"]] == [[64], [5e-4, 1e-3], [0.5, 0.6], [0.5, 0.7, 0.9]]
+    assert [axis["values"] for axis in found["axes"]] == [
+        [64],
+        [5e-4, 1e-3],
+        [0.5, 0.6],
+        [0.5, 0.7, 0.9],
+    ]
     assert not [name for name in by_name if re.search("_stderr|_seed|ci95|snapshot|status", name)]
 
 
@@ -87,12 +102,21 @@ def test_instant_is_packed_without_visible_loss() -> None:
     raw = base64.b64decode(packed["data"])
     n, p = packed["grains"], packed["pairs"]
     x, y, i, j = np.split(np.frombuffer(raw[: 4 * (n + p)], "<u2"), [n, 2 * n, 2 * n + p])
-    radius, speed, force, clustered = np.split(np.frombuffer(raw[4 * (n + p) :], np.uint8), [n, 2 * n, 2 * n + p])
-    cell = np.stack([one.positions[:, 0] - one.tilt * one.positions[:, 1], one.positions[:, 1]], axis=-1) / one.side
+    radius, speed, force, clustered = np.split(
+        np.frombuffer(raw[4 * (n + p) :], np.uint8), [n, 2 * n, 2 * n + p]
+    )
+    cell = (
+        np.stack(
+            [one.positions[:, 0] - one.tilt * one.positions[:, 1], one.positions[:, 1]], axis=-1
+        )
+        / one.side
+    )
     assert np.all(np.abs((np.stack([x, y], axis=-1) / 65536 - cell + 0.5) % 1 - 0.5) <= 1 / 65536)
     np.testing.assert_array_equal(np.stack([i, j], axis=-1), one.pairs)
     np.testing.assert_array_equal(clustered, one.clustered)
-    np.testing.assert_allclose(radius / 255 * packed["radius"], one.radii, atol=one.radii.max() / 500)
+    np.testing.assert_allclose(
+        radius / 255 * packed["radius"], one.radii, atol=one.radii.max() / 500
+    )
     np.testing.assert_allclose(speed / 255, np.minimum(one.speed / scale.speed, 1), atol=1 / 500)
     np.testing.assert_allclose(force / 255, np.minimum(one.force / scale.force, 1), atol=1 / 500)
 
@@ -116,7 +140,11 @@ def test_million_points_are_thinned_with_a_word_about_it() -> None:
 
 def test_names_and_attributes_cannot_leave_the_data_of_a_page() -> None:
     page = jg.explore(page_map())
-    assert "hacked = 1</script>" not in page.text and "<img" not in page.text and "<u>name" not in page.text
+    assert (
+        "hacked = 1</script>" not in page.text
+        and "<img" not in page.text
+        and "<u>name" not in page.text
+    )
     assert written(page)["title"] == MARKUP
     assert "own <u>name</u>" in [one["name"] for one in written(page)["observables"]]
     assert f"<title>{html.escape(MARKUP)}</title>" in page.text
@@ -135,9 +163,15 @@ def test_attribute_that_is_no_option_gives_no_command_to_paste(name: str) -> Non
     data = page_map()
     again = map_data(data)["again"]
     assert again["options"] == "--solver barzilai-borwein --activation midpoint --tolerance 0.0001"
-    assert_same_numbers(again["strain"], flattened(data)["seeds/strain"].mean("seed").sortby("timestep").values)
-    jammed = flattened(data).assign(force_ratio=data.force_ratio.where(data.restitution > data.restitution.min()))
-    assert sum(strain is None for strain in map_data(jammed)["again"]["strain"]) > again["strain"].count(None)
+    assert_same_numbers(
+        again["strain"], flattened(data)["seeds/strain"].mean("seed").sortby("timestep").values
+    )
+    jammed = flattened(data).assign(
+        force_ratio=data.force_ratio.where(data.restitution > data.restitution.min())
+    )
+    assert sum(strain is None for strain in map_data(jammed)["again"]["strain"]) > again[
+        "strain"
+    ].count(None)
     assert map_data(flattened(data).assign_attrs({name: "midpoint; rm -rf ~"}))["again"] is None
 
 
@@ -153,12 +187,18 @@ def test_a_page_has_the_verdict_on_every_flow_in_the_range_of_the_reference_map(
     table = shipped_table()
     low, high = table.range("packing_fraction")
     nus, alphas = np.array([low - 0.01, 0.5, high]), np.array([0.5, 0.9])
-    said = map_data(ratio_dataset(2, 3).assign_coords(packing_fraction=nus, restitution=alphas))["reference"]
+    said = map_data(ratio_dataset(2, 3).assign_coords(packing_fraction=nus, restitution=alphas))[
+        "reference"
+    ]
     assert said["flows"][:2] == [None, None] and f"{low:g} to {high:g}" in said["outside"]
-    for flow, (nu, alpha) in zip(said["flows"][2:], [(nu, alpha) for nu in nus[1:] for alpha in alphas], strict=True):
+    for flow, (nu, alpha) in zip(
+        said["flows"][2:], [(nu, alpha) for nu in nus[1:] for alpha in alphas], strict=True
+    ):
         found = jg.validity(alpha, nu)
         assert flow["verdict"] == found.verdict()
-        assert [row[0] for row in flow["rows"]] == [name.replace("_", " ") for name in found.measured]
+        assert [row[0] for row in flow["rows"]] == [
+            name.replace("_", " ") for name in found.measured
+        ]
         assert all(len(row) == len(said["columns"]) for row in flow["rows"])
 
 
@@ -169,7 +209,9 @@ def test_a_page_without_a_map_is_the_reference_map_with_every_point_of_its_table
     places = [nus.index(nu) * len(alphas) + alphas.index(alpha) for alpha, nu in flows_of(table)]
     for name in (*MEASURED, "force_ratio"):
         assert_same_numbers([by_name[name]["value"][k] for k in places], table.columns[name])
-        assert_same_numbers([by_name[name]["error"][k] for k in places], table.columns[f"{name}_stderr"])
+        assert_same_numbers(
+            [by_name[name]["error"][k] for k in places], table.columns[f"{name}_stderr"]
+        )
     assert all(page["reference"]["flows"])
     assert page["title"].endswith(table.made_with)
 

@@ -1,4 +1,6 @@
-"""Neighbour lists against brute force: complete while they are valid, also after large shear; never silently short."""
+"""Neighbour lists against brute force: complete while they are valid, also after large shear; never
+silently short.
+"""
 
 from dataclasses import replace
 
@@ -29,7 +31,9 @@ EPS = np.finfo(float).eps
 compiled_first = jax.jit(first_true, static_argnums=1)
 
 
-@pytest.mark.parametrize(("length", "size"), [(1, 3), (31, 8), (32, 40), (33, 5), (496, 96), (5000, 64)])
+@pytest.mark.parametrize(
+    ("length", "size"), [(1, 3), (31, 8), (32, 40), (33, 5), (496, 96), (5000, 64)]
+)
 @settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.01, 0.1, 0.5, 0.99, 1.0]))
 def test_first_true_entries(length, size, seed, density):
@@ -49,8 +53,12 @@ def both_separations(hood: PairLists, side):
 
 @pytest.mark.parametrize(("motion", "shear"), [(0.03, 0.02), (0.0, 0.05), (0.05, 0.0)])
 @pytest.mark.parametrize("packing_fraction", [0.2, 0.75])
-def test_valid_list_holds_every_touching_pair_under_motion_and_shear(packed, packing_fraction, motion, shear):
-    """Random motion of every grain and shear over several remaps of the tilt, with the pairs of brute force."""
+def test_valid_list_holds_every_touching_pair_under_motion_and_shear(
+    packed, packing_fraction, motion, shear
+):
+    """Random motion of every grain and shear over several remaps of the tilt, with the pairs of
+    brute force.
+    """
     state, rng = packed(packing_fraction), np.random.default_rng(5)
     side, radii = float(state.side), np.asarray(state.grains.radii)
     hood = build(state.positions, state.grains, state.side, state.tilt)
@@ -58,7 +66,9 @@ def test_valid_list_holds_every_touching_pair_under_motion_and_shear(packed, pac
     for _ in range(120):
         before = float(hood.tilt + hood.frame.strain)
         moves = motion * rng.normal(size=state.positions.shape)
-        hood, rebuilt, positions, tilt = move(hood, state.grains, state.side, moves, jnp.asarray(shear))
+        hood, rebuilt, positions, tilt = move(
+            hood, state.grains, state.side, moves, jnp.asarray(shear)
+        )
         assert not (hood.near.overflow | hood.outer.overflow)
         touch = pairs_within(0, positions, radii, side, tilt)
         assert touch <= listed_pairs(hood.near)
@@ -68,11 +78,15 @@ def test_valid_list_holds_every_touching_pair_under_motion_and_shear(packed, pac
             remaps + bool(abs(before - tilt) > 0.4),
         )
         if rebuilt:
-            assert pairs_within(float(hood.near.skin) - 1e-12, positions, radii, side, tilt) <= listed_pairs(hood.near)
+            assert pairs_within(
+                float(hood.near.skin) - 1e-12, positions, radii, side, tilt
+            ) <= listed_pairs(hood.near)
         frozen, direct = (np.asarray(x) for x in both_separations(hood, state.side))
         short = np.linalg.norm(direct, axis=-1) < 0.49 * side
         filled = np.asarray(hood.near.reach) > 0
-        np.testing.assert_allclose(frozen[filled & short], direct[filled & short], rtol=0, atol=64 * EPS * side)
+        np.testing.assert_allclose(
+            frozen[filled & short], direct[filled & short], rtol=0, atol=64 * EPS * side
+        )
         assert np.all(np.linalg.norm(frozen, axis=-1)[~filled] > 2 * side)
     assert rebuilds >= 2
     assert touching > 30 or motion == 0
@@ -85,13 +99,17 @@ def test_lists_are_built_for_every_tilt(packed):
         hood = build(state.positions, state.grains, state.side, jnp.asarray(tilt))
         for listed in (hood.outer, hood.near):
             assert not listed.overflow and listed.skin > 0
-            near = pairs_within(float(listed.skin) - 1e-12, state.positions, state.grains.radii, state.side, tilt)
+            near = pairs_within(
+                float(listed.skin) - 1e-12, state.positions, state.grains.radii, state.side, tilt
+            )
             assert near <= listed_pairs(listed)
 
 
 def test_lists_of_a_dilute_flow_reach_far(packed):
     """The skin grows with the free path, up to half of the cell."""
-    dilute, dense = (build(s.positions, s.grains, s.side, s.tilt).near.skin for s in (packed(0.1), packed(0.8)))
+    dilute, dense = (
+        build(s.positions, s.grains, s.side, s.tilt).near.skin for s in (packed(0.1), packed(0.8))
+    )
     assert dilute > 4 * dense > 0
 
 
@@ -101,12 +119,18 @@ def clustered(count: int, side: float, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("buffer", ["NEAR_PAIRS_PER_GRAIN", "OUTER_PAIRS_PER_GRAIN"])
 def test_pairs_left_out_are_flagged(packed, monkeypatch, buffer):
-    """With a buffer that is too small a list is complete, or says that it is not: by its flag or a skin used up."""
+    """With a buffer that is too small a list is complete, or says that it is not: by its flag or a
+    skin used up.
+    """
     state, flags = packed(0.7), []
     monkeypatch.setattr(near_pairs, buffer, 2)
     tiny = jax.jit(lambda *arguments: pair_lists(*arguments))
     for seed in range(6):
-        places = state.positions if seed == 0 else clustered(len(state.positions), float(state.side), seed)
+        places = (
+            state.positions
+            if seed == 0
+            else clustered(len(state.positions), float(state.side), seed)
+        )
         hood = tiny(places, state.grains, state.side, state.tilt)
         touch = pairs_within(0, places, state.grains.radii, state.side, state.tilt)
         flags.append(bool(hood.near.overflow) or float(hood.near.skin) < 0)
@@ -120,12 +144,16 @@ def test_flag_of_the_outer_list_reaches_the_near_one(packed, monkeypatch):
     monkeypatch.setattr(near_pairs, "NEAR_PAIRS_PER_GRAIN", 10)
     state = packed(0.7)
     places = clustered(len(state.positions), float(state.side), 0)
-    hood = jax.jit(lambda *arguments: pair_lists(*arguments))(places, state.grains, state.side, state.tilt)
+    hood = jax.jit(lambda *arguments: pair_lists(*arguments))(
+        places, state.grains, state.side, state.tilt
+    )
     assert hood.outer.overflow and hood.near.overflow
 
 
 def test_near_list_filtered_after_large_shear_holds_every_pair_within_its_skin():
-    """In dilute flow the skin is wider than a grain: shear then brings in pairs from farther than touching ones."""
+    """In dilute flow the skin is wider than a grain: shear then brings in pairs from farther than
+    touching ones.
+    """
     rng, count = np.random.default_rng(0), 256
     grains = Grains(jnp.full(count, 0.5), jnp.ones(count))
     side = jnp.sqrt(count * jnp.pi / 4 / 0.1)
@@ -134,11 +162,14 @@ def test_near_list_filtered_after_large_shear_holds_every_pair_within_its_skin()
         positions = jnp.asarray(rng.uniform(size=(count, 2))) * side
         hood = build(positions, grains, side, jnp.asarray(0.0))
         for strain in (0.2, 0.5, 1.0):
-            hood = replace(hood, frame=Frame(jnp.zeros_like(positions), jnp.asarray(strain) + 0 * hood.frame.strain))
+            hood = replace(
+                hood,
+                frame=Frame(jnp.zeros_like(positions), jnp.asarray(strain) + 0 * hood.frame.strain),
+            )
             hood = sheared(hood, jnp.asarray(True))
             now, tilt = present(hood, side)
             assert not (hood.near.overflow | hood.outer.overflow)
             skin = float(hood.near.skin) - 1e-12
-            assert pairs_within(skin, now, np.asarray(grains.radii), float(side), float(tilt)) <= listed_pairs(
-                hood.near
-            )
+            assert pairs_within(
+                skin, now, np.asarray(grains.radii), float(side), float(tilt)
+            ) <= listed_pairs(hood.near)

@@ -1,4 +1,6 @@
-"""Compiled programs that are kept on disk: found without tracing, compiled again if anything they depend on changes."""
+"""Compiled programs that are kept on disk: found without tracing, compiled again if anything they
+depend on changes.
+"""
 
 import time
 from pathlib import Path
@@ -42,8 +44,12 @@ def test_second_process_neither_traces_nor_compiles(folder: Path) -> None:
     np.testing.assert_array_equal(second["product"], [0.0, 2.0, 4.0])
 
 
-@pytest.mark.parametrize("change", ["shape", "precision", "structure", "flag of JAX", "source, version or processor"])
-def test_whatever_a_program_depends_on_compiles_it_again(folder: Path, change: str, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    "change", ["shape", "precision", "structure", "flag of JAX", "source, version or processor"]
+)
+def test_whatever_a_program_depends_on_compiles_it_again(
+    folder: Path, change: str, monkeypatch
+) -> None:
     traces: list = []
     counted(traces)(*ARGUMENTS)
     pair, factor = ARGUMENTS
@@ -88,7 +94,9 @@ def test_program_that_calls_a_library_of_scipy_is_not_kept(folder: Path) -> None
 
 
 def test_who_waits_for_a_file_that_is_removed_does_not_enter_with_the_next(tmp_path: Path) -> None:
-    """The first removes the file of the lock and leaves; the second has waited for it, the third makes a new one."""
+    """The first removes the file of the lock and leaves; the second has waited for it, the third
+    makes a new one.
+    """
     path, inside, most = tmp_path / "new" / "file", [], []
 
     def enter(pause: float) -> None:

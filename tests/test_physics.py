@@ -1,4 +1,6 @@
-"""Laws that cross modules: rebound, energy, momentum, power balance, Bagnold's scaling, simultaneous impacts."""
+"""Laws that cross modules: rebound, energy, momentum, power balance, Bagnold's scaling,
+simultaneous impacts.
+"""
 
 from dataclasses import replace
 
@@ -21,7 +23,8 @@ from jaxgran.sampling.steady_state import heated
 
 EPS = np.finfo(float).eps
 COLLISIONS, BLOCKS = 100, 50
-# Share of the power that one iteration wastes at least; one of the numba engine is a sweep over all contacts
+# Share of the power that one iteration wastes at least; one of the numba engine is a sweep over all
+# contacts
 WASTED = {"numba": 5e-4, "jax": 1e-2}
 
 
@@ -41,19 +44,32 @@ def energy(state: State) -> float:
 
 @pytest.mark.parametrize("restitution", [0.0, 0.6, 1.0])
 def test_two_discs_rebound_with_the_coefficient_of_restitution(engine_run, scene, restitution):
-    """At random phases of the step, speeds, angles, sizes and offsets; the normal is that of the change itself."""
+    """At random phases of the step, speeds, angles, sizes and offsets; the normal is that of the
+    change itself.
+    """
     rng = np.random.default_rng(int(10 * restitution))
     for _ in range(COLLISIONS):
-        radii, angle, offset = rng.uniform(0.37, 0.63, 2), rng.uniform(0, 2 * np.pi), rng.uniform(-0.8, 0.8)
-        along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        radii, angle, offset = (
+            rng.uniform(0.37, 0.63, 2),
+            rng.uniform(0, 2 * np.pi),
+            rng.uniform(-0.8, 0.8),
+        )
+        along, across = (
+            np.array([np.cos(angle), np.sin(angle)]),
+            np.array([-np.sin(angle), np.cos(angle)]),
+        )
         speed, timestep = rng.uniform(1, 10), 10 ** rng.uniform(-5, -3)
         reach = np.sum(radii)
         travel = rng.uniform(1, 3) * speed * timestep
         apart = along * (np.sqrt(1 - offset**2) * reach + travel) + across * offset * reach
         places, drift = 8 + np.array([apart, [0, 0]]), rng.normal(size=2)
         share = rng.uniform(0, 1)
-        before = scene(places, [drift - share * speed * along, drift + (1 - share) * speed * along], radii)
-        after, tally = engine_run(flow_of(0.02, restitution=restitution, timestep=timestep), before, 8)
+        before = scene(
+            places, [drift - share * speed * along, drift + (1 - share) * speed * along], radii
+        )
+        after, tally = engine_run(
+            flow_of(0.02, restitution=restitution, timestep=timestep), before, 8
+        )
         assert tally.collisions > 0
         kick = pair_velocity(after) - pair_velocity(before)
         normal = kick / np.linalg.norm(kick)
@@ -61,8 +77,16 @@ def test_two_discs_rebound_with_the_coefficient_of_restitution(engine_run, scene
         rebound = -(normal @ pair_velocity(after)) / (normal @ pair_velocity(before))
         assert rebound == pytest.approx(restitution, rel=0, abs=1e-10)
         masses = np.asarray(before.grains.masses)[:2]
-        lost = (1 - restitution**2) / 2 * np.prod(masses) / np.sum(masses) * (normal @ pair_velocity(before)) ** 2
-        assert [tally.dissipation, tally.binary_dissipation] == pytest.approx([lost, lost], rel=1e-9, abs=1e-9)
+        lost = (
+            (1 - restitution**2)
+            / 2
+            * np.prod(masses)
+            / np.sum(masses)
+            * (normal @ pair_velocity(before)) ** 2
+        )
+        assert [tally.dissipation, tally.binary_dissipation] == pytest.approx(
+            [lost, lost], rel=1e-9, abs=1e-9
+        )
         assert tally.status == Status.ok
 
 
@@ -72,7 +96,9 @@ def test_three_touching_balls_in_a_row_share_the_momentum_at_once(engine_run, sc
     before = scene([[3, 4], [4, 4], [5, 4]], [[1, 0], [0, 0], [0, 0]])
     after, tally = engine_run(flow_of(0.02, restitution=1.0, activation=activation), before, 1)
     laboratory = np.asarray(after.velocities)[:3] + np.array([[4, 0]])
-    np.testing.assert_allclose(laboratory, [[-1 / 3, 0], [2 / 3, 0], [2 / 3, 0]], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        laboratory, [[-1 / 3, 0], [2 / 3, 0], [2 / 3, 0]], rtol=0, atol=1e-11
+    )
     assert tally.contacts == 2
 
 
@@ -82,9 +108,16 @@ POINTS = [(0.75, 1e-2), (0.6, 1e-3)]
 
 @pytest.mark.parametrize(("packing_fraction", "timestep"), POINTS)
 @pytest.mark.parametrize("restitution", [0.0, 0.9, 1.0])
-def test_no_step_gains_energy_and_elastic_steps_keep_it(engine_run, flowing, packing_fraction, timestep, restitution):
-    """In the frame of the contacts: the fall of the peculiar energy and the work of the shear on the impulses."""
-    state, flow = flowing(packing_fraction), flow_of(packing_fraction, restitution=restitution, timestep=timestep)
+def test_no_step_gains_energy_and_elastic_steps_keep_it(
+    engine_run, flowing, packing_fraction, timestep, restitution
+):
+    """In the frame of the contacts: the fall of the peculiar energy and the work of the shear on
+    the impulses.
+    """
+    state, flow = (
+        flowing(packing_fraction),
+        flow_of(packing_fraction, restitution=restitution, timestep=timestep),
+    )
     lost, exchanged = [], []
     for _ in range(60):
         after, tally = engine_run(flow, state, 1)
@@ -110,17 +143,23 @@ def test_impulses_are_proportional_to_one_plus_restitution(engine_run, flowing, 
     flow, changes = flow_of(packing_fraction, timestep=1e-2), []
     for restitution in (0.0, 0.3, 1.0):
         after, tally = engine_run(replace(flow, restitution=restitution), state, 1)
-        turned = np.asarray(after.velocities) + flow.timestep * np.asarray(after.velocities)[:, 1:] * [1, 0]
+        turned = np.asarray(after.velocities) + flow.timestep * np.asarray(after.velocities)[
+            :, 1:
+        ] * [1, 0]
         changes.append((turned - np.asarray(state.velocities)) / (1 + restitution))
         sums = [tally.impulse, tally.binary_impulse, *np.ravel(tally.contact_moment)]
         changes[-1] = np.append(changes[-1], np.array(sums) / (1 + restitution))
     assert np.max(np.abs(changes[0])) > 0.1
-    np.testing.assert_allclose(changes[1:], [changes[0]] * 2, rtol=0, atol=64 * EPS * np.max(np.abs(changes[0])))
+    np.testing.assert_allclose(
+        changes[1:], [changes[0]] * 2, rtol=0, atol=64 * EPS * np.max(np.abs(changes[0]))
+    )
 
 
 @pytest.mark.parametrize("drift", [(0.0, 0.0), (0.3, 0.7)])
 def test_momentum_is_conserved(engine_run, flowing, drift):
-    """m c_y stays, and m c_x falls by γ̇ m c_y t: a drift across the shear changes nothing in the laboratory."""
+    """m c_y stays, and m c_x falls by γ̇ m c_y t: a drift across the shear changes nothing in the
+    laboratory.
+    """
     state = flowing(0.75)
     state = replace(state, velocities=state.velocities + jnp.asarray([drift]))
     flow, steps = flow_of(0.75), 400
@@ -128,19 +167,25 @@ def test_momentum_is_conserved(engine_run, flowing, drift):
     before, time = momentum(state), steps * flow.timestep
     assert tally.solves > 50
     rounding = EPS * float(tally.impulse) * np.sqrt(tally.contacts)
-    np.testing.assert_allclose(momentum(after), before - [time * before[1], 0], rtol=0, atol=rounding)
+    np.testing.assert_allclose(
+        momentum(after), before - [time * before[1], 0], rtol=0, atol=rounding
+    )
 
 
 @pytest.mark.parametrize("activation", ["midpoint", "touching"])
 @pytest.mark.parametrize(("packing_fraction", "timestep"), POINTS)
-def test_shear_power_is_dissipation_and_change_of_energy(engine_run, flowing, packing_fraction, timestep, activation):
+def test_shear_power_is_dissipation_and_change_of_energy(
+    engine_run, flowing, packing_fraction, timestep, activation
+):
     state = flowing(packing_fraction)
     flow = flow_of(packing_fraction, timestep=timestep, restitution=0.3, activation=activation)
     after, tally = engine_run(flow, state, 300, BarzilaiBorwein())
     power = -(tally.contact_moment + tally.kinetic_moment)[0, 1]  # ∫ τ γ̇ A dt with γ̇ = 1
     assert tally.solves > 20 and tally.dissipation > 0
     change = energy(after) - energy(state)
-    assert tally.dissipation + change == pytest.approx(float(power), rel=0, abs=1e-11 * float(tally.dissipation))
+    assert tally.dissipation + change == pytest.approx(
+        float(power), rel=0, abs=1e-11 * float(tally.dissipation)
+    )
 
 
 @pytest.mark.parametrize(("packing_fraction", "restitution"), [(0.3, 0.9), (0.7, 0.0), (0.8, 0.4)])
@@ -149,14 +194,20 @@ def test_flow_without_shear_keeps_its_momentum_and_loses_what_it_dissipates(
 ):
     velocities = np.random.default_rng(0).normal(size=(GRAINS, 2))
     state = replace(packed(packing_fraction), velocities=jnp.asarray(velocities))
-    after, tally = engine_run(flow_of(packing_fraction, restitution=restitution, shear_rate=0.0), state, 300)
+    after, tally = engine_run(
+        flow_of(packing_fraction, restitution=restitution, shear_rate=0.0), state, 300
+    )
     np.testing.assert_allclose(momentum(after), momentum(state), rtol=0, atol=1e-10)
     assert float(tally.energy_change) <= 1e-12 * energy(state)
     np.testing.assert_allclose(tally.energy_change, -tally.dissipation, atol=1e-8 * energy(state))
 
 
-def test_energy_balance_tests_the_books_and_the_complementarity_power_the_solver(engine, engine_run, flowing):
-    """The balance closes however badly a network is solved; the power that impulses waste falls with the tolerance."""
+def test_energy_balance_tests_the_books_and_the_complementarity_power_the_solver(
+    engine, engine_run, flowing
+):
+    """The balance closes however badly a network is solved; the power that impulses waste falls
+    with the tolerance.
+    """
     flow, state = flow_of(0.75, restitution=0.1), flowing(0.75)
     wasted = []
     for tolerance, cap in ((1e-12, 1), (1e-2, 5000), (1e-4, 5000), (1e-8, 5000)):
@@ -171,7 +222,9 @@ def test_energy_balance_tests_the_books_and_the_complementarity_power_the_solver
 
 @pytest.mark.parametrize("packing_fraction", [0.2, 0.75])
 def test_no_contact_is_missed_over_large_shear(engine_run, flowing, packing_fraction):
-    """Overlaps by brute force stay within those that were met as contacts and one step of the fastest pair."""
+    """Overlaps by brute force stay within those that were met as contacts and one step of the
+    fastest pair.
+    """
     state, flow, tilts = flowing(packing_fraction), flow_of(packing_fraction, restitution=0.7), []
     for _ in range(BLOCKS):
         state, tally = engine_run(flow, state, 60, BarzilaiBorwein())
@@ -190,19 +243,37 @@ def test_moments_are_symmetric_and_the_stresses_compress(engine_run, flowing):
         assert np.all(np.linalg.eigvalsh(moment) > 0)
 
 
-@pytest.mark.parametrize("packing_fraction", [0.2, 0.75, 0.8])  # at 0.82 one in four cells of 64 grains jams
-def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit(engine_run, flowing, packing_fraction):
-    """Bagnold's scaling: rigid grains have no time scale but that of the shear, so stresses go with its square."""
+@pytest.mark.parametrize(
+    "packing_fraction", [0.2, 0.75, 0.8]
+)  # at 0.82 one in four cells of 64 grains jams
+def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit(
+    engine_run, flowing, packing_fraction
+):
+    """Bagnold's scaling: rigid grains have no time scale but that of the shear, so stresses go with
+    its square.
+    """
     steps = 500
-    state, flow, solver = flowing(packing_fraction), flow_of(packing_fraction), BarzilaiBorwein(max_steps=100_000)
+    state, flow, solver = (
+        flowing(packing_fraction),
+        flow_of(packing_fraction),
+        BarzilaiBorwein(max_steps=100_000),
+    )
     faster = replace(flow, shear_rate=2.0, timestep=flow.timestep / 2)
     slow, slow_tally = engine_run(flow, state, steps, solver)
-    fast, fast_tally = engine_run(faster, replace(state, velocities=2 * state.velocities), steps, solver)
+    fast, fast_tally = engine_run(
+        faster, replace(state, velocities=2 * state.velocities), steps, solver
+    )
     assert slow_tally.solves > (5 if packing_fraction == 0.2 else 50)
     np.testing.assert_array_equal(fast.positions, slow.positions)
     np.testing.assert_array_equal(fast.tilt, slow.tilt)
     np.testing.assert_array_equal(fast.velocities, 2 * slow.velocities)
-    powers = {"impulse": 2, "binary_impulse": 2, "contact_moment": 2, "binary_moment": 2, "kinetic_moment": 2}
+    powers = {
+        "impulse": 2,
+        "binary_impulse": 2,
+        "contact_moment": 2,
+        "binary_moment": 2,
+        "kinetic_moment": 2,
+    }
     powers |= {"cluster_moment": 2, "local_kinetic": 2, "wave_kinetic": 2}
     powers |= {
         "binary_speed_moment": 4,
@@ -235,10 +306,12 @@ def test_a_flow_that_is_moved_repeats_its_trajectory_there(engine_run, flowing):
 
 
 def test_a_gas_without_shear_cools_as_haffs_law_says() -> None:
-    """ln T = −(1 − α²)/2 C after C collisions a grain; times N/(N − 1), as the total momentum is zero.
+    """ln T = −(1 − α²)/2 C after C collisions a grain; times N/(N − 1), as the total momentum is
+    zero.
 
-    A collision takes (1 − α²) w²/4 of energy, w² exponential with the mean 4T: so ln T has the standard deviation
-    (1 − α²) √(C/2N) in one run. Sonine's correction to the loss, 3 a₂/16, is 0.4 %.
+    A collision takes (1 − α²) w²/4 of energy, w² exponential with the mean 4T: so ln T has the
+    standard deviation (1 − α²) √(C/2N) in one run. Sonine's correction to the loss, 3 a₂/16, is 0.4
+    %.
     """
     alpha, seeds, count = 0.95, 8, 64
     flow = ShearFlow(count, alpha, 0.3, 1e-3, shear_rate=0.0, polydispersity=0.0)
@@ -263,4 +336,6 @@ def test_compiled_velocities_equal_the_interpreted_ones(flowing):
         separations = displacement(state.positions[i], state.positions[j], state.side, state.tilt)
         return relative_velocity(state.velocities, i, j, separations, jnp.asarray(1.0))
 
-    np.testing.assert_allclose(jax.jit(relative)(state), relative(state), rtol=0, atol=64 * EPS * float(state.side))
+    np.testing.assert_allclose(
+        jax.jit(relative)(state), relative(state), rtol=0, atol=64 * EPS * float(state.side)
+    )

@@ -11,7 +11,12 @@ from jaxgran.maps.progress import Meter
 from jaxgran.maps.replica import Advance
 from jaxgran.maps.settings import chosen_settings
 
-MAP: dict[str, Any] = {"restitution": (0.2, 0.9), "packing_fraction": (0.8,), "grains": 64, "timestep": 1e-4}
+MAP: dict[str, Any] = {
+    "restitution": (0.2, 0.9),
+    "packing_fraction": (0.8,),
+    "grains": 64,
+    "timestep": 1e-4,
+}
 SETTINGS, _ = chosen_settings(MapParameters(**MAP, seeds=2, strain=4.0, equilibrate=1.0))
 
 

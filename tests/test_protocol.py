@@ -1,4 +1,6 @@
-"""A flow starts as theory says, is sheared until it is steady by a stated criterion, and its time step is shortened."""
+"""A flow starts as theory says, is sheared until it is steady by a stated criterion, and its time
+step is shortened.
+"""
 
 import re
 from dataclasses import replace
@@ -79,7 +81,10 @@ def test_a_drifting_record_is_refused() -> None:
 
 def test_after_the_last_chunk_noise_is_accepted_and_drift_is_not() -> None:
     noise = 0.5 * np.random.default_rng(3).normal(size=(500, 40))
-    drifting, relaxing = noise + np.linspace(0.0, 4.0, 40), noise + 4.0 * np.exp(-np.linspace(0.0, 2.0, 40))
+    drifting, relaxing = (
+        noise + np.linspace(0.0, 4.0, 40),
+        noise + 4.0 * np.exp(-np.linspace(0.0, 2.0, 40)),
+    )
     assert np.mean([steady_state._is_level_noise(one, 0.5) for one in noise]) > 0.99
     for series in (drifting, relaxing):
         assert np.mean([steady_state._is_level_noise(one, 0.5) for one in series]) < 0.05
@@ -95,17 +100,23 @@ def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch) -> None:
 
     def averages(*_):
         n = len(sheared)
-        temperature = np.exp([0.02 * rng.normal(), n / 10, rng.normal(), 0.02 * rng.normal(), np.nan])
+        temperature = np.exp(
+            [0.02 * rng.normal(), n / 10, rng.normal(), 0.02 * rng.normal(), np.nan]
+        )
         pressure = np.exp([0.02 * rng.normal(), 0.0, rng.normal(), -n / 10, np.nan])
         return {"granular_temperature": temperature, "pressure": pressure}
 
     monkeypatch.setattr(steady_state, "_chunk", chunk)
     monkeypatch.setattr(steady_state, "_averages", averages)
-    monkeypatch.setattr(steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain)
+    monkeypatch.setattr(
+        steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain
+    )
     start: Any = SimpleNamespace(side=np.full(5, 10.0))
     status = np.array([0, 0, 0, 0, Status.nonfinite])
     flow = stack([FLOWS[0]] * 5)
-    end = steady_state._until_steady(Batch(flow, Numerics(), start, status, np.zeros(5), np.full(5, 3.2)), None)
+    end = steady_state._until_steady(
+        Batch(flow, Numerics(), start, status, np.zeros(5), np.full(5, 3.2)), None
+    )
     bad = Status.not_steady
     np.testing.assert_array_equal(
         end.status, [Status.ok, bad, Status.ok, bad, Status.nonfinite]
@@ -128,8 +139,13 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
     monkeypatch.setattr(steady_state, "_sheared", sheared)
     flow, coarse = with_timesteps(1e-5, 2e-4), with_timesteps(1e-3, 1e-3)
     state: Any = SimpleNamespace(side=jnp.full(2, 10.0))
-    end = steady_state._shortened(Batch(coarse, Numerics(), state, np.zeros(2), np.zeros(2), np.ones(2)), flow, None)
-    timesteps, strains = np.array([dt for dt, _ in record]), np.array([strain for _, strain in record])
+    end = steady_state._shortened(
+        Batch(coarse, Numerics(), state, np.zeros(2), np.zeros(2), np.ones(2)), flow, None
+    )
+    timesteps, strains = (
+        np.array([dt for dt, _ in record]),
+        np.array([strain for _, strain in record]),
+    )
     ladder = np.vstack([coarse.timestep, timesteps])
     np.testing.assert_allclose(ladder[1:, 0] / ladder[:-1, 0], 10**-0.5, rtol=1e-6)
     np.testing.assert_allclose(ladder[1:2, 1] / ladder[:1, 1], 0.2**0.5, rtol=1e-6)
@@ -139,7 +155,9 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
     assert end.flow is flow
 
     record.clear()
-    steady_state._shortened(Batch(flow, Numerics(), state, np.zeros(2), np.zeros(2), np.ones(2)), flow, None)
+    steady_state._shortened(
+        Batch(flow, Numerics(), state, np.zeros(2), np.zeros(2), np.ones(2)), flow, None
+    )
     assert record == []
 
 
@@ -168,7 +186,9 @@ def test_flow_is_steady_by_the_last_two_thirds_of_its_record(monkeypatch) -> Non
     )
     flow = stack([ShearFlow(32, 0.5, 0.6, 1e-3)])
     state: Any = SimpleNamespace(side=np.array([6.0]))
-    monkeypatch.setattr(steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain)
+    monkeypatch.setattr(
+        steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain
+    )
     end = steady_state._until_steady(
         Batch(flow, Numerics(), state, np.zeros(1, int), np.zeros(1), np.array([4.0])), None
     )
@@ -184,8 +204,12 @@ def test_coarse_time_step_is_never_shorter_than_the_one_asked_for() -> None:
 
 
 @pytest.mark.parametrize("alphas", [(0.5, 0.9), (0.85, 0.4)])
-def test_a_time_step_too_long_is_a_sentence_that_names_the_longest(alphas: tuple[float, float]) -> None:
-    flow = replace(with_timesteps(0.1, 0.1), restitution=jnp.asarray(alphas), packing_fraction=jnp.full(2, 0.4))
+def test_a_time_step_too_long_is_a_sentence_that_names_the_longest(
+    alphas: tuple[float, float],
+) -> None:
+    flow = replace(
+        with_timesteps(0.1, 0.1), restitution=jnp.asarray(alphas), packing_fraction=jnp.full(2, 0.4)
+    )
     theory = predicted(flow)
     with pytest.raises(ValueError, match="timestep must be at most") as caught:
         check_timestep(flow, theory)
@@ -194,7 +218,9 @@ def test_a_time_step_too_long_is_a_sentence_that_names_the_longest(alphas: tuple
     assert one_sentence(message)
     assert f"restitution {max(alphas)} and packing fraction 0.4" in message  # the hotter of the two
     longest = float(re.search(r"at most ([\d.e+-]+) at", message)[1])
-    crossed = longest * np.sqrt(2 * np.max(np.asarray(theory.granular_temperature)))  # at thermal speed
+    crossed = longest * np.sqrt(
+        2 * np.max(np.asarray(theory.granular_temperature))
+    )  # at thermal speed
     assert 0.09 < crossed <= 0.1
     check_timestep(replace(flow, timestep=jnp.full(2, longest)), theory)
 
@@ -214,7 +240,9 @@ def test_prepare_of_many_keys_gives_the_state_of_each(batch, keys) -> None:
 def test_prepare_names_the_replicas_that_failed(batch, keys, monkeypatch) -> None:
     bad = batch._replace(status=np.array([Status.ok, Status.not_steady]))
     monkeypatch.setattr(steady_state, "prepare_batch", lambda *_, **__: bad)
-    with pytest.raises(RuntimeError, match=r"^not all replicas could be prepared: 1 \(not_steady\)\.$"):
+    with pytest.raises(
+        RuntimeError, match=r"^not all replicas could be prepared: 1 \(not_steady\)\.$"
+    ):
         prepare(FLOWS[0], keys)
 
 
@@ -238,8 +266,12 @@ def test_a_replica_that_is_given_up_is_not_advanced_and_changes_no_other(batch) 
     assert_same_bits(replica(end.state, 1), replica(batch.state, 1))
 
 
-def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(batch, monkeypatch) -> None:
-    """Both replicas start with a strain of 0.64, in 32 blocks of two steps; the limit is four times that."""
+def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(
+    batch, monkeypatch
+) -> None:
+    """Both replicas start with a strain of 0.64, in 32 blocks of two steps; the limit is four times
+    that.
+    """
     monkeypatch.setattr(steady_state, "LONGEST_STRAIN", 2.56)
     monkeypatch.setattr(steady_state, "LONGEST_CORRELATION_STRAINS", 0)
     _, short = sample_batch(batch, 0.64)
@@ -252,7 +284,9 @@ def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(batch
         assert reached or end.status[k] >= Status.strain_limit
         assert np.isclose(strains[k], 0.64) == (errors[k] <= target)
         assert reached or np.isclose(strains[k], 2.56)
-        _, alone = sample_batch(jax.tree.map(lambda x, k=k: x[k : k + 1], batch), 0.64, error=float(target))
+        _, alone = sample_batch(
+            jax.tree.map(lambda x, k=k: x[k : k + 1], batch), 0.64, error=float(target)
+        )
         assert_same_bits(replica(alone, 0), replica(grown, k))
 
 
@@ -263,7 +297,9 @@ def test_sample_that_has_grown_is_the_sample_of_its_strain(batch, monkeypatch) -
     _, whole = sample_batch(batch, 0.64)
     np.testing.assert_allclose(grown.tally.steps, whole.tally.steps)
     for name in ("duration", "impulse", "contact_moment", "kinetic_moment", "largest_overlap"):
-        np.testing.assert_allclose(getattr(grown.tally, name), getattr(whole.tally, name), rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(
+            getattr(grown.tally, name), getattr(whole.tally, name), rtol=1e-6, atol=1e-12
+        )
 
 
 def test_report_is_told_every_replica_step(batch) -> None:
@@ -274,19 +310,28 @@ def test_report_is_told_every_replica_step(batch) -> None:
 
 def test_a_sample_lasts_six_memories_and_one_of_less_than_four_says_so(batch, monkeypatch) -> None:
     monkeypatch.setattr(steady_state, "LEAST_SAMPLE", 0.5)
-    monkeypatch.setattr(steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain)
+    monkeypatch.setattr(
+        steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain
+    )
     ready = batch._replace(status=np.zeros(2, int), correlation_strain=np.array([0.2, 0.4]))
     _, long = sample_batch(ready, None)
     np.testing.assert_allclose(np.sum(long.tally.duration, axis=1), [1.2, 2.4])
     end, _ = sample_batch(ready, 1.0)
-    assert (end.status[0] == Status.short_sample, end.status[1] >= Status.short_sample) == (False, True)
+    assert (end.status[0] == Status.short_sample, end.status[1] >= Status.short_sample) == (
+        False,
+        True,
+    )
 
 
-def test_a_sample_for_an_error_is_at_least_twice_as_long_and_its_longest_strain_says_so(batch, monkeypatch) -> None:
+def test_a_sample_for_an_error_is_at_least_twice_as_long_and_its_longest_strain_says_so(
+    batch, monkeypatch
+) -> None:
     monkeypatch.setattr(steady_state, "LEAST_SAMPLE", 0.32)
     monkeypatch.setattr(steady_state, "LONGEST_STRAIN", 0.64)
     monkeypatch.setattr(steady_state, "LONGEST_CORRELATION_STRAINS", 0)
-    monkeypatch.setattr(steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain)
+    monkeypatch.setattr(
+        steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain
+    )
     ready = batch._replace(status=np.zeros(2, int), correlation_strain=np.full(2, 0.01))
     for error, status in ((1e9, Status.ok), (1e-9, Status.strain_limit)):
         end, measured = sample_batch(ready, None, error=error)

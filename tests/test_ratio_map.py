@@ -1,4 +1,6 @@
-"""Every replica runs once, and its numbers depend on nothing but its seed and its place in the grid."""
+"""Every replica runs once, and its numbers depend on nothing but its seed and its place in the
+grid.
+"""
 
 import inspect
 from dataclasses import fields, replace
@@ -72,7 +74,12 @@ numbers = st.floats(0.0, 1.0)
 
 @given(
     points=st.lists(
-        st.tuples(st.sampled_from([64, 1000]), numbers, st.floats(0.01, 0.83), st.sampled_from([1e-3, 1e-5])),
+        st.tuples(
+            st.sampled_from([64, 1000]),
+            numbers,
+            st.floats(0.01, 0.83),
+            st.sampled_from([1e-3, 1e-5]),
+        ),
         min_size=1,
         max_size=12,
     ),
@@ -97,7 +104,9 @@ def test_every_replica_runs_once_the_most_expensive_first_and_a_batch_has_one_nu
     assert len(tasks) >= min(workers, len(keys))  # no worker is idle
 
 
-def test_cost_of_strain_grows_with_density_and_dissipation_and_less_than_the_number_of_steps() -> None:
+def test_cost_of_strain_grows_with_density_and_dissipation_and_less_than_the_number_of_steps() -> (
+    None
+):
     def cost(alpha: float, nu: float, dt: float = 1e-3) -> float:
         return predicted_cost(ShearFlow(64, alpha, nu, dt))
 
@@ -106,7 +115,9 @@ def test_cost_of_strain_grows_with_density_and_dissipation_and_less_than_the_num
     assert predicted_cost(ShearFlow(640, 0.5, 0.6, 1e-3)) == pytest.approx(10 * cost(0.5, 0.6))
 
 
-def test_results_do_not_depend_on_the_size_company_and_order_of_the_batches(settings, results) -> None:
+def test_results_do_not_depend_on_the_size_company_and_order_of_the_batches(
+    settings, results
+) -> None:
     assert_same_bits(in_batches(1, settings), results)
     mixed = [
         *run_replicas_module._run_task(settings, [(1, 1), (0, 0)]),
@@ -127,20 +138,29 @@ def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> No
 
 
 @pytest.mark.parametrize("bad", [Status.capacity, Status.nonfinite, Status.infeasible])
-def test_a_replica_that_came_to_nothing_keeps_its_status_and_is_in_no_average(settings, bad, monkeypatch) -> None:
-    """Of another time step its force ratio would be another, so it is not run again with a shorter one."""
+def test_a_replica_that_came_to_nothing_keeps_its_status_and_is_in_no_average(
+    settings, bad, monkeypatch
+) -> None:
+    """Of another time step its force ratio would be another, so it is not run again with a shorter
+    one.
+    """
     rng, calls = np.random.default_rng(0), []
     task = [(0, 0), (0, 1), (1, 0), (1, 1)]
 
     def measured(_, keys, advance, record=None):
         calls.append(list(keys))
-        return [(key, random_replica(rng, settings, bad if key == (0, 1) else Status.ok)) for key in keys]
+        return [
+            (key, random_replica(rng, settings, bad if key == (0, 1) else Status.ok))
+            for key in keys
+        ]
 
     monkeypatch.setattr(run_replicas_module, "_measured", measured)
     done = dict(run_replicas_module._run_task(settings, task))
     assert calls == [task] and [done[key].status for key in task] == [0, bad, 0, 0]
     data = map_dataset(settings, done, {})
-    assert float(data.force_ratio.values.ravel()[0]) == pytest.approx(float(done[0, 0].sample.force_ratio))
+    assert float(data.force_ratio.values.ravel()[0]) == pytest.approx(
+        float(done[0, 0].sample.force_ratio)
+    )
 
 
 def test_a_recorder_follows_one_replica_at_a_time(settings, monkeypatch) -> None:
@@ -156,14 +176,18 @@ def test_a_recorder_follows_one_replica_at_a_time(settings, monkeypatch) -> None
     assert sizes == [1] * 60 and len(done) == 60
 
 
-def test_a_batch_that_does_not_fit_into_the_memory_is_halved(settings, results, tmp_path, monkeypatch) -> None:
+def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
+    settings, results, tmp_path, monkeypatch
+) -> None:
     """Its numbers stay the same; a single replica that does not fit is an error."""
     measured, largest, sizes = run_replicas_module._measured, 1, []
 
     def bounded(settings, task, advance, record=None):
         sizes.append(len(task))
         if len(task) > largest:
-            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 1 byte.")
+            raise jax.errors.JaxRuntimeError(
+                "RESOURCE_EXHAUSTED: Out of memory while trying to allocate 1 byte."
+            )
         return measured(settings, task, advance)
 
     monkeypatch.setattr(run_replicas_module, "_measured", bounded)
@@ -177,7 +201,9 @@ def test_a_batch_that_does_not_fit_into_the_memory_is_halved(settings, results, 
         run_replicas_module._run_task(settings, tasks)
 
 
-def test_replicas_have_the_numbers_of_their_seed_whatever_the_first_one_is(settings, results) -> None:
+def test_replicas_have_the_numbers_of_their_seed_whatever_the_first_one_is(
+    settings, results
+) -> None:
     second = in_batches(2, replace(settings, seeds=1, first_seed=1))
     assert_same_bits(second, {(point, 0): results[point, 1] for point in range(2)})
 
@@ -194,7 +220,9 @@ def test_ratio_map_warns_of_points_and_shows_progress(monkeypatch, capsys) -> No
     assert "2/2 points" in capsys.readouterr().err
 
 
-def test_a_map_that_is_cut_off_is_continued_and_written_once(settings, results, tmp_path, monkeypatch) -> None:
+def test_a_map_that_is_cut_off_is_continued_and_written_once(
+    settings, results, tmp_path, monkeypatch
+) -> None:
     folder, output = tmp_path / "map.nc.unfinished", tmp_path / "map.nc"
     monkeypatch.setattr("jaxgran.maps.batches.batch_size", lambda *_: 2)
 
@@ -227,7 +255,9 @@ def test_an_interrupted_map_raises_with_its_finished_part(tmp_path, monkeypatch)
     monkeypatch.setattr(ratio_map_module, "run_replicas", some)
     with pytest.raises(Interrupted) as caught:
         ratio_map(**SETTINGS, output=tmp_path / "map.nc", attributes={"project": "mine"})
-    assert np.isfinite(caught.value.data.force_ratio[0, 1]) and np.isnan(caught.value.data.force_ratio[0, 0])
+    assert np.isfinite(caught.value.data.force_ratio[0, 1]) and np.isnan(
+        caught.value.data.force_ratio[0, 0]
+    )
     assert caught.value.data.attrs["project"] == "mine"
     np.testing.assert_array_equal(open_map(tmp_path / "map.nc").status, caught.value.data.status)
 
@@ -237,37 +267,61 @@ def test_ratio_map_is_the_dataset_of_the_replicas(settings, results) -> None:
     expected = map_dataset(settings, results, {})
     np.testing.assert_array_equal(data["sums/tally"], expected["sums/tally"])
     np.testing.assert_array_equal(data.pressure_stderr, expected.pressure_stderr)
-    assert set(data.attrs) - set(expected.attrs) == {"automatic_choice", "resumed_replicas", *MEASURED}
+    assert set(data.attrs) - set(expected.attrs) == {
+        "automatic_choice",
+        "resumed_replicas",
+        *MEASURED,
+    }
     assert data.attrs["wall_time_seconds"] > 0
     steps = 4 * round((SETTINGS["strain"] + SETTINGS["equilibrate"]) / 1e-3)
-    assert data.attrs["wall_time_seconds"] * data.attrs["replica_steps_per_second"] == pytest.approx(steps)
+    assert data.attrs["wall_time_seconds"] * data.attrs[
+        "replica_steps_per_second"
+    ] == pytest.approx(steps)
 
 
-def test_first_of_several_time_steps_has_the_numbers_of_a_map_at_it_alone(settings, results) -> None:
+def test_first_of_several_time_steps_has_the_numbers_of_a_map_at_it_alone(
+    settings, results
+) -> None:
     some = replace(settings, timestep=(1e-3, 5e-4))
     both = in_batches(8, some)
-    assert_same_bits({key: replica for key, replica in both.items() if key[0] < len(settings.flows())}, results)
+    assert_same_bits(
+        {key: replica for key, replica in both.items() if key[0] < len(settings.flows())}, results
+    )
     data, alone = map_dataset(some, both, {}), map_dataset(settings, results, {})
     xr.testing.assert_equal(data.isel(timestep=0), alone)
     assert not np.any(data.force_ratio[0] == data.force_ratio[1])
 
 
-def test_first_of_several_numbers_of_grains_has_the_numbers_of_a_map_at_it_alone(settings, results) -> None:
-    """The larger one has an area that is larger in proportion, and both stand at their place in the dataset."""
+def test_first_of_several_numbers_of_grains_has_the_numbers_of_a_map_at_it_alone(
+    settings, results
+) -> None:
+    """The larger one has an area that is larger in proportion, and both stand at their place in the
+    dataset.
+    """
     several = {**SETTINGS, "grains": [32, 64], "seeds": 1}
     data = ratio_map(**several)
     assert data.force_ratio.dims == ("grains", "packing_fraction", "restitution")
-    assert data.grains.values.tolist() == data.attrs["grains"] == [32, 64] and data.grains.dtype.kind == "i"
+    assert (
+        data.grains.values.tolist() == data.attrs["grains"] == [32, 64]
+        and data.grains.dtype.kind == "i"
+    )
     assert {"long_name", "units"} <= set(data.grains.attrs)
-    alone = map_dataset(replace(settings, seeds=1), {key: x for key, x in results.items() if key[1] == 0}, {})
+    alone = map_dataset(
+        replace(settings, seeds=1), {key: x for key, x in results.items() if key[1] == 0}, {}
+    )
     first = data.isel(grains=0).to_dataset()
     xr.testing.assert_equal(first, alone.to_dataset())
     assert not np.any(data.pressure[0] == data.pressure[1])
-    assert set(choices_of(data)["grains"]) == {32, 64} and choices_of(data.sel(grains=64))["grains"] == 64
+    assert (
+        set(choices_of(data)["grains"]) == {32, 64}
+        and choices_of(data.sel(grains=64))["grains"] == 64
+    )
 
 
 def test_the_function_has_the_arguments_of_the_table_and_says_what_they_mean() -> None:
-    assert list(inspect.signature(ratio_map).parameters) == [row.name for row in fields(RunParameters)]
+    assert list(inspect.signature(ratio_map).parameters) == [
+        row.name for row in fields(RunParameters)
+    ]
     for row in fields(RunParameters):
         assert f"{row.name}: {row.metadata['option'].help}" in str(ratio_map.__doc__)
     with pytest.raises(TypeError, match="restitutions"):

@@ -1,4 +1,6 @@
-"""A batch of flows has the results of its replicas: called directly, under ``jax.vmap``, and one by one."""
+"""A batch of flows has the results of its replicas: called directly, under ``jax.vmap``, and one by
+one.
+"""
 
 import re
 from dataclasses import replace
@@ -35,7 +37,9 @@ def states() -> State:
 
 
 def assert_same(one: Any, other: Any, but: str = "nothing") -> None:
-    for (path, left), right in zip(jax.tree_util.tree_leaves_with_path(one), jax.tree.leaves(other), strict=True):
+    for (path, left), right in zip(
+        jax.tree_util.tree_leaves_with_path(one), jax.tree.leaves(other), strict=True
+    ):
         name = jax.tree_util.keystr(path)
         rtol = 4 * np.finfo(float).eps if but in name else 0
         np.testing.assert_allclose(left, right, rtol=rtol, atol=0, err_msg=name)
@@ -71,8 +75,12 @@ def test_what_lacks_the_axis_is_the_same_for_all_replicas(states: State) -> None
 
 
 def test_strains_and_steps_may_differ_between_replicas(states: State) -> None:
-    np.testing.assert_array_equal(sample(FLOWS, states, np.array([0.1, 0.2, 0.3]))[1]._total.steps, [100, 200, 300])
-    np.testing.assert_array_equal(jax.jit(jg.advance)(FLOWS, states, np.array([1, 0, 3]))[1].steps, [1, 0, 3])
+    np.testing.assert_array_equal(
+        sample(FLOWS, states, np.array([0.1, 0.2, 0.3]))[1]._total.steps, [100, 200, 300]
+    )
+    np.testing.assert_array_equal(
+        jax.jit(jg.advance)(FLOWS, states, np.array([1, 0, 3]))[1].steps, [1, 0, 3]
+    )
 
 
 def test_snapshots_take_a_batch(states: State) -> None:
@@ -82,16 +90,22 @@ def test_snapshots_take_a_batch(states: State) -> None:
 
 @pytest.mark.parametrize("numerics", [{}, {"engine": jg.Jax()}, {"solver": jg.Jacobi()}])
 @pytest.mark.parametrize("platform", ["cpu", "accelerator"])
-def test_replicas_advance_together_on_an_accelerator_only(states: State, numerics: Any, platform: str, monkeypatch):
+def test_replicas_advance_together_on_an_accelerator_only(
+    states: State, numerics: Any, platform: str, monkeypatch
+):
     monkeypatch.setattr(engine, "default_device", lambda: SimpleNamespace(platform=platform))
-    found = over_replicas(lambda flow, _: flow.restitution * float(in_batch()), Numerics(**numerics), (FLOWS, states))
+    found = over_replicas(
+        lambda flow, _: flow.restitution * float(in_batch()), Numerics(**numerics), (FLOWS, states)
+    )
     np.testing.assert_array_equal(found, ALPHAS * float(platform == "accelerator"))
 
 
 def test_more_replicas_up_to_a_power_of_two_compile_nothing(states: State, monkeypatch) -> None:
     traced = []
     original = sample_module._sample_blocks
-    monkeypatch.setattr(sample_module, "_sample_blocks", lambda *x: (traced.append(x), original(*x))[1])
+    monkeypatch.setattr(
+        sample_module, "_sample_blocks", lambda *x: (traced.append(x), original(*x))[1]
+    )
     for count in (5, 6, 8, 7):
         many = np.arange(count) % 3
         _, found = jg.sample(FLOWS[many], states[many], 0.1, blocks=3)
@@ -100,13 +114,31 @@ def test_more_replicas_up_to_a_power_of_two_compile_nothing(states: State, monke
 
 
 MISTAKES = {
-    "flows and states of other numbers": (lambda s: sample(FLOWS, s[:2], 0.1), "one axis of replicas"),
+    "flows and states of other numbers": (
+        lambda s: sample(FLOWS, s[:2], 0.1),
+        "one axis of replicas",
+    ),
     "strains of another number": (lambda s: sample(FLOWS, s, np.ones(2)), "one axis of replicas"),
-    "two axes": (lambda s: sample(jax.tree.map(lambda x: x[None], FLOWS), s, 0.1), "one axis of replicas"),
-    "another packing fraction": (lambda s: sample(replace(FLOWS, packing_fraction=0.6), s, 0.1), "must be 0.5, which"),
-    "a strain below zero": (lambda s: sample(FLOWS, s, np.array([0.1, 0.1, -1])), "a positive number"),
-    "a callback": (lambda s: sample(FLOWS, s, 0.1, callback=print), "callback must be None for a batch"),
-    "steps below zero": (lambda s: jg.advance(FLOWS, s, np.array([1, 2, -1])), "a whole number of 0 to"),
+    "two axes": (
+        lambda s: sample(jax.tree.map(lambda x: x[None], FLOWS), s, 0.1),
+        "one axis of replicas",
+    ),
+    "another packing fraction": (
+        lambda s: sample(replace(FLOWS, packing_fraction=0.6), s, 0.1),
+        "must be 0.5, which",
+    ),
+    "a strain below zero": (
+        lambda s: sample(FLOWS, s, np.array([0.1, 0.1, -1])),
+        "a positive number",
+    ),
+    "a callback": (
+        lambda s: sample(FLOWS, s, 0.1, callback=print),
+        "callback must be None for a batch",
+    ),
+    "steps below zero": (
+        lambda s: jg.advance(FLOWS, s, np.array([1, 2, -1])),
+        "a whole number of 0 to",
+    ),
     "one key": (lambda _: jg.prepare(FLOWS, KEYS[0]), "one for each key"),
 }
 
@@ -131,10 +163,17 @@ def test_example_of_the_readme_runs_and_stands_in_the_help(capsys: pytest.Captur
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
     printed, shown = (
         np.array(
-            [re.findall(r"\d+\.\d+|nan", line) for line in re.findall("^α = .*: .* ± .*", text, re.MULTILINE)], float
+            [
+                re.findall(r"\d+\.\d+|nan", line)
+                for line in re.findall("^α = .*: .* ± .*", text, re.MULTILINE)
+            ],
+            float,
         )
         for text in (capsys.readouterr().out, readme)
     )
     assert printed.shape == (9, 4)
     np.testing.assert_array_equal(printed[:, :2], shown[:, :2])
-    assert np.all(abs(printed[:, 2] - shown[:, 2]) <= 4 * np.hypot(np.nan_to_num(printed[:, 3]), shown[:, 3]) + 1e-3)
+    assert np.all(
+        abs(printed[:, 2] - shown[:, 2])
+        <= 4 * np.hypot(np.nan_to_num(printed[:, 3]), shown[:, 3]) + 1e-3
+    )

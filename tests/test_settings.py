@@ -1,4 +1,6 @@
-"""Every mistake in the parameters of a map is one sentence that names the accepted range, before anything runs."""
+"""Every mistake in the parameters of a map is one sentence that names the accepted range, before
+anything runs.
+"""
 
 from dataclasses import fields, replace
 from itertools import product
@@ -32,17 +34,27 @@ def test_a_plane_in_any_order_is_sorted_with_the_grains_of_its_points() -> None:
     grains = dict(zip(product((1e-3, 1e-4), *mixed.values()), range(16, 28), strict=True))
     given = {**GOOD, **mixed, "timestep": (1e-3, 1e-4), "grains_by_point": list(grains.values())}
     settings, _ = chosen(**given)
-    assert settings.axes == {"timestep": (1e-3, 1e-4), "packing_fraction": (0.6, 0.7), "restitution": (0.1, 0.5, 0.9)}
+    assert settings.axes == {
+        "timestep": (1e-3, 1e-4),
+        "packing_fraction": (0.6, 0.7),
+        "restitution": (0.1, 0.5, 0.9),
+    }
     for flow in settings.flows():
         assert grains[flow.timestep, flow.packing_fraction, flow.restitution] == flow.grains
 
 
 def test_grains_and_time_step_are_axes_where_they_are_lists_and_then_the_slowest() -> None:
-    one, some = MapSettings(**GOOD), MapSettings(**{**GOOD, "grains": (64, 256), "timestep": (1e-3, 1e-4)})
+    one, some = (
+        MapSettings(**GOOD),
+        MapSettings(**{**GOOD, "grains": (64, 256), "timestep": (1e-3, 1e-4)}),
+    )
     assert (one.sizes, some.sizes) == ((64,), (64, 256))
     assert list(one.axes) == ["packing_fraction", "restitution"]
     assert list(some.axes) == ["grains", "timestep", "packing_fraction", "restitution"]
-    points = [(flow.grains, flow.timestep, flow.packing_fraction, flow.restitution) for flow in some.flows()]
+    points = [
+        (flow.grains, flow.timestep, flow.packing_fraction, flow.restitution)
+        for flow in some.flows()
+    ]
     assert points == list(product(*some.axes.values()))
     assert some.flows()[:2] == one.flows()
 
@@ -52,7 +64,9 @@ def chosen(**parameters: Any) -> tuple[MapSettings, str]:
 
 
 def test_automatic_time_step_does_not_depend_on_the_numbers_of_grains() -> None:
-    one, several = (chosen(**{**GOOD, "timestep": "auto", "grains": grains}) for grains in (64, (64, 1024)))
+    one, several = (
+        chosen(**{**GOOD, "timestep": "auto", "grains": grains}) for grains in (64, (64, 1024))
+    )
     assert several == (replace(one[0], grains=(64, 1024)), one[1])
 
 
@@ -100,13 +114,25 @@ def test_a_given_tolerance_is_that_of_the_solver() -> None:
 
 
 def test_the_command_and_the_function_start_alike() -> None:
-    """What is left to Python has no text form, and what is left to the command is about figures and the terminal."""
+    """What is left to Python has no text form, and what is left to the command is about figures and
+    the terminal.
+    """
     python_only = {"observe", "grains_by_point", "progress", "record", "attributes"}
-    assert set(MAP_OPTIONS) - {"format", "quiet"} == {one.name for one in fields(RunParameters)} - python_only
+    assert (
+        set(MAP_OPTIONS) - {"format", "quiet"}
+        == {one.name for one in fields(RunParameters)} - python_only
+    )
     assert with_start({}) == PRESETS["quick"]
-    assert with_start({"error": 0.1}).items() >= {"grains": "auto", "timestep": "auto", "seeds": 1}.items()
+    assert (
+        with_start({"error": 0.1}).items()
+        >= {"grains": "auto", "timestep": "auto", "seeds": 1}.items()
+    )
     assert with_start({"preset": "paper", "seeds": 3})["seeds"] == 3
-    for wrong in ({"preset": "slow"}, {"preset": "quick", "from_map": "map.nc"}, {"from_map": "no.nc"}):
+    for wrong in (
+        {"preset": "slow"},
+        {"preset": "quick", "from_map": "map.nc"},
+        {"from_map": "no.nc"},
+    ):
         with refused():
             with_start(wrong)
 
@@ -115,7 +141,10 @@ def test_an_error_chooses_grains_by_point_and_one_time_step() -> None:
     given = {"restitution": (0.2, 0.9), "packing_fraction": (0.6, 0.82), "error": 0.2, "seeds": 1}
     settings, sentence = chosen(**given, grains="auto", timestep="auto")
     for flow in settings.flows():
-        assert size_error(float(flow.restitution), float(flow.packing_fraction), flow.grains) <= 0.6 * 0.2
+        assert (
+            size_error(float(flow.restitution), float(flow.packing_fraction), flow.grains)
+            <= 0.6 * 0.2
+        )
     assert len({flow.grains for flow in settings.flows()}) > 1
     assert f"{settings.grains} grains, 1 seed" in sentence and "error of 0.2" in sentence
     assert {flow.timestep for flow in settings.flows()} == {settings.timestep}

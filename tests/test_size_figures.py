@@ -1,4 +1,6 @@
-"""The figure of the number of grains shows every average over its value at the largest N; other figures show that N."""
+"""The figure of the number of grains shows every average over its value at the largest N; other
+figures show that N.
+"""
 
 from pathlib import Path
 
@@ -21,13 +23,17 @@ def curves_of(figure: Figure) -> list:
 
 
 @pytest.mark.parametrize(("alphas", "nus"), [(2, 2), (4, 3)])
-def test_every_average_is_drawn_over_its_value_at_the_largest_number_of_grains(alphas: int, nus: int) -> None:
+def test_every_average_is_drawn_over_its_value_at_the_largest_number_of_grains(
+    alphas: int, nus: int
+) -> None:
     data = with_grains(ratio_dataset(alphas, nus), *SIZES)
     figure = averages_against_grains(data.isel(grains=[1, 2, 0]))
     rows = nus if alphas * nus > 8 else 1
     assert len(figure.axes) == rows * len(NAMES)
     assert all(axes.get_xscale() == "log" for axes in figure.axes)
-    points = [(nu, alpha) for nu in data.packing_fraction.values for alpha in data.restitution.values]
+    points = [
+        (nu, alpha) for nu in data.packing_fraction.values for alpha in data.restitution.values
+    ]
     of_a_row = len(points) // rows
     expected = [
         (name, *point)
@@ -38,11 +44,15 @@ def test_every_average_is_drawn_over_its_value_at_the_largest_number_of_grains(a
     for container, (name, nu, alpha) in zip(curves_of(figure), expected, strict=True):
         point = data.sel(packing_fraction=nu, restitution=alpha)
         reference = point[name].values[-1]
-        np.testing.assert_allclose(container.lines[0].get_xydata(), np.stack([SIZES, point[name] / reference], -1))
+        np.testing.assert_allclose(
+            container.lines[0].get_xydata(), np.stack([SIZES, point[name] / reference], -1)
+        )
         ends = np.array([segment[:, 1] for segment in container.lines[2][0].get_segments()])
         relative = point[f"{name}_stderr"].values / point[name].values
         of_both = np.sqrt(relative**2 + relative[-1] ** 2) * point[name].values / reference
-        np.testing.assert_allclose(np.diff(ends)[:, 0], 2 * np.where(np.arange(len(SIZES)) < 2, of_both, 0.0))
+        np.testing.assert_allclose(
+            np.diff(ends)[:, 0], 2 * np.where(np.arange(len(SIZES)) < 2, of_both, 0.0)
+        )
 
 
 def test_parts_are_the_maps_at_every_number_of_grains_and_time_step() -> None:
@@ -58,7 +68,11 @@ def test_parts_are_the_maps_at_every_number_of_grains_and_time_step() -> None:
 
 def test_several_numbers_of_grains_have_a_file_of_their_own(tmp_path: Path, monkeypatch) -> None:
     write_without_drawing(monkeypatch)
-    written = save_figures(with_timesteps(with_grains(ratio_dataset(2, 2), 64, 256), 1e-3, 1e-4), tmp_path / "map")
-    assert [path.name for path in written] == [f"map_{name}.png" for name in ("curves", "contours", "timestep", "size")]
+    written = save_figures(
+        with_timesteps(with_grains(ratio_dataset(2, 2), 64, 256), 1e-3, 1e-4), tmp_path / "map"
+    )
+    assert [path.name for path in written] == [
+        f"map_{name}.png" for name in ("curves", "contours", "timestep", "size")
+    ]
     one = save_figures(with_grains(ratio_dataset(1, 2), 256), tmp_path / "one")
     assert [path.name for path in one] == ["one_curves.png"]

@@ -1,4 +1,6 @@
-"""The sizes of the grains of a map: measured with the discs that are given, kept in the file, and repeated from it."""
+"""The sizes of the grains of a map: measured with the discs that are given, kept in the file, and
+repeated from it.
+"""
 
 from typing import Any
 
@@ -35,7 +37,9 @@ def bidisperse(tmp_path_factory: pytest.TempPathFactory) -> xr.DataTree:
     return data
 
 
-def test_the_grains_are_those_that_are_given_at_the_packing_fraction(bidisperse: xr.DataTree) -> None:
+def test_the_grains_are_those_that_are_given_at_the_packing_fraction(
+    bidisperse: xr.DataTree,
+) -> None:
     seen = bidisperse["states"]
     sizes = 2 * np.sort(seen.radii.values.ravel())
     np.testing.assert_allclose(sizes, np.repeat([1.0, RATIO], 16) / (1 + RATIO) * 2, rtol=1e-3)
@@ -62,7 +66,9 @@ def test_a_map_is_repeated_from_its_file_to_the_bit(bidisperse: xr.DataTree) -> 
     assert uniform.force_ratio.equals(ratio_map(**MAP).force_ratio)
 
 
-def test_the_width_of_the_uniform_distribution_is_a_setting_of_a_map(bidisperse: xr.DataTree) -> None:
+def test_the_width_of_the_uniform_distribution_is_a_setting_of_a_map(
+    bidisperse: xr.DataTree,
+) -> None:
     wide = ratio_map(**MAP, polydispersity=0.5, snapshots=True)
     assert wide["states"].radii.max().item() == pytest.approx(0.75 * (1 - 1 / 96), rel=1e-3)
     assert wide.attrs["polydispersity"] == 0.5
@@ -72,11 +78,15 @@ def test_the_width_of_the_uniform_distribution_is_a_setting_of_a_map(bidisperse:
 
 def test_other_sizes_are_another_map(bidisperse: xr.DataTree) -> None:
     output = bidisperse.attrs["file"]
-    with pytest.raises(InputError, match=r"has a map with diameters .1\.0, 1\.4. and not .1\.0, 2\.0."):
+    with pytest.raises(
+        InputError, match=r"has a map with diameters .1\.0, 1\.4. and not .1\.0, 2\.0."
+    ):
         ratio_map(**MAP, diameters=[1.0, 2.0], snapshots=True, output=output)
     with pytest.raises(InputError, match=r"has a map with diameters .1\.0, 1\.4. and not None"):
         ratio_map(**MAP, snapshots=True, output=output)
 
 
 def test_a_polydispersity_of_a_file_is_replaced_by_diameters() -> None:
-    assert combined({"polydispersity": 0.1}, {"diameters": (1.0, RATIO)}) == {"diameters": (1.0, RATIO)}
+    assert combined({"polydispersity": 0.1}, {"diameters": (1.0, RATIO)}) == {
+        "diameters": (1.0, RATIO)
+    }

@@ -1,4 +1,6 @@
-"""Snapshots are the flow itself: their forces are those of the next step, and taking them changes nothing."""
+"""Snapshots are the flow itself: their forces are those of the next step, and taking them changes
+nothing.
+"""
 
 from dataclasses import replace
 
@@ -59,7 +61,9 @@ def test_taking_snapshots_changes_nothing(flow, flowing, run, series) -> None:
 
 
 def test_sums_over_the_snapshots_of_every_step_are_those_of_the_tally(flow, flowing, run) -> None:
-    """The stress of all contacts, and of those in clusters, which the tally finds without walking through any."""
+    """The stress of all contacts, and of those in clusters, which the tally finds without walking
+    through any.
+    """
     state, steps = flowing(0.78), 40
     _, tally = run(flow, state, steps)
     one_snapshot, contact, clustered = jax.jit(snapshot), np.zeros((2, 2)), np.zeros((2, 2))
@@ -67,10 +71,14 @@ def test_sums_over_the_snapshots_of_every_step_are_those_of_the_tally(flow, flow
         seen = one_snapshot(flow, state, EXACT)
         loaded = np.flatnonzero(np.asarray(seen.impulses) > 0)
         i, j = (np.asarray(x)[loaded] for x in (seen.contacts.i, seen.contacts.j))
-        normals, distances = (np.asarray(x)[loaded] for x in (seen.contacts.normals, seen.contacts.distances))
+        normals, distances = (
+            np.asarray(x)[loaded] for x in (seen.contacts.normals, seen.contacts.distances)
+        )
         sizes = (np.asarray(seen.impulses)[loaded] * distances)[:, None, None]
         moments = sizes * normals[:, :, None] * normals[:, None]
-        _, cluster = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(GRAINS, GRAINS)), directed=False)
+        _, cluster = connected_components(
+            coo_array((np.ones(len(i)), (i, j)), shape=(GRAINS, GRAINS)), directed=False
+        )
         contact += moments.sum(axis=0)
         clustered += moments[np.bincount(cluster)[cluster[i]] >= 3].sum(axis=0)
         state, _ = run(flow, state, 1)
@@ -93,7 +101,9 @@ def test_flight_there_and_back_is_where_it_started(flow, flowing) -> None:
     assert_same_flow(flown(flown(state, 1.0, 0.7), 1.0, -0.7), replace(state), 1e-12)
 
 
-@pytest.mark.parametrize(("packing_fraction", "temperature", "timestep"), [(0.3, 250.0, 0.05), (0.1, 2000.0, 0.1)])
+@pytest.mark.parametrize(
+    ("packing_fraction", "temperature", "timestep"), [(0.3, 250.0, 0.05), (0.1, 2000.0, 0.1)]
+)
 def test_a_fast_coarse_flow_has_all_its_contacts_or_says_that_some_may_be_missing(
     packed, packing_fraction, temperature, timestep
 ) -> None:

@@ -1,4 +1,6 @@
-"""One call for any contact problem: against independent solvers, by the contact law, and as JAX transforms it."""
+"""One call for any contact problem: against independent solvers, by the contact law, and as JAX
+transforms it.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -57,15 +59,23 @@ def by_nnls(problem: DelassusProblem) -> np.ndarray:
 def test_network_and_its_matrix_have_the_exact_velocities(seed, discs, restitution):
     network, matrix, velocities = network_of(seed, discs)
     contacts, masses, _ = random_network(seed, discs)
-    normals, (i, j), used = np.asarray(network.normals), np.asarray(network.ends).T, np.asarray(contacts.used)
+    normals, (i, j), used = (
+        np.asarray(network.normals),
+        np.asarray(network.ends).T,
+        np.asarray(contacts.used),
+    )
     stopped = exact_velocities(contacts, masses, velocities)
     before, after = (np.sum(normals * (v[i] - v[j]), axis=1) for v in (velocities, stopped))
     expected = before + (1 + restitution) * (after - before)
-    as_matrix = DelassusProblem(jnp.asarray(np.where(np.eye(len(used)) > used, 1, matrix)), network.approach)
+    as_matrix = DelassusProblem(
+        jnp.asarray(np.where(np.eye(len(used)) > used, 1, matrix)), network.approach
+    )
     for problem in (network, as_matrix):
         solution = solve_contacts(problem, restitution, solver=BarzilaiBorwein(1e-11, 100_000))
         assert solution.status == Status.ok
-        np.testing.assert_allclose(np.asarray(solution.velocities)[used], expected[used], rtol=0, atol=1e-8)
+        np.testing.assert_allclose(
+            np.asarray(solution.velocities)[used], expected[used], rtol=0, atol=1e-8
+        )
         assert np.all(np.asarray(solution.impulses)[~used] == 0)
 
 
@@ -114,11 +124,24 @@ def test_dense_and_sparse_matrices_are_the_same_problem():
     approach, count = network.approach, len(matrix)
     rows, columns = np.nonzero(matrix)
     split = np.concatenate([matrix[rows, columns] / 4, 3 * matrix[rows, columns] / 4, [np.pi]])
-    places = np.concatenate([np.stack([rows, columns], 1), np.stack([rows, columns], 1), [[count, count]]])
-    twice = BCOO((jnp.asarray(split), jnp.asarray(places)), shape=(count, count))  # in two parts, and padded
-    forms = (matrix, scipy.sparse.csr_array(matrix), scipy.sparse.coo_matrix(matrix), BCOO.fromdense(matrix), twice)
+    places = np.concatenate(
+        [np.stack([rows, columns], 1), np.stack([rows, columns], 1), [[count, count]]]
+    )
+    twice = BCOO(
+        (jnp.asarray(split), jnp.asarray(places)), shape=(count, count)
+    )  # in two parts, and padded
+    forms = (
+        matrix,
+        scipy.sparse.csr_array(matrix),
+        scipy.sparse.coo_matrix(matrix),
+        BCOO.fromdense(matrix),
+        twice,
+    )
     first, *others = [
-        solve_contacts(DelassusProblem(jnp.asarray(x) if x is matrix else x, approach), solver=BarzilaiBorwein(1e-12))
+        solve_contacts(
+            DelassusProblem(jnp.asarray(x) if x is matrix else x, approach),
+            solver=BarzilaiBorwein(1e-12),
+        )
         for x in forms
     ]
     for other in others:
@@ -129,25 +152,34 @@ def test_dense_and_sparse_matrices_are_the_same_problem():
 @pytest.mark.parametrize("method", [Nesterov, Jacobi])
 def test_every_bounded_method_solves_a_matrix(method):
     problem = replace(
-        matrix_problem(1), matrix=jnp.asarray(np.eye(SIZE) + 0.5 * (np.eye(SIZE, k=1) + np.eye(SIZE, k=-1)))
+        matrix_problem(1),
+        matrix=jnp.asarray(np.eye(SIZE) + 0.5 * (np.eye(SIZE, k=1) + np.eye(SIZE, k=-1))),
     )
     solution = solve_contacts(problem, solver=method(1e-9))
     assert solution.status == Status.ok
-    np.testing.assert_allclose(solution.impulses, by_nnls(problem), atol=1e-7 * np.max(solution.impulses))
+    np.testing.assert_allclose(
+        solution.impulses, by_nnls(problem), atol=1e-7 * np.max(solution.impulses)
+    )
 
 
 def test_walls_do_not_move_and_one_contact_is_exact():
-    wall = ContactNetwork(jnp.array([[0, 1]]), jnp.array([[0.0, 1.0]]), jnp.array([2.0, jnp.inf]), jnp.array([-3.0]))
+    wall = ContactNetwork(
+        jnp.array([[0, 1]]), jnp.array([[0.0, 1.0]]), jnp.array([2.0, jnp.inf]), jnp.array([-3.0])
+    )
     solution = solve_contacts(wall, restitution=0.5)
     assert solution.impulses == 9.0 and solution.velocities == 1.5
-    assert solve_contacts(DelassusProblem(jnp.array([[0.5]]), jnp.array([-3.0])), 0.5).impulses == 9.0
+    assert (
+        solve_contacts(DelassusProblem(jnp.array([[0.5]]), jnp.array([-3.0])), 0.5).impulses == 9.0
+    )
 
 
 def test_single_precision_stays_single():
     problem = jax.tree.map(lambda x: x.astype(jnp.float32), matrix_problem(0))
     solution = solve_contacts(problem, 0.5, solver=BarzilaiBorwein(1e-4))
     assert solution.impulses.dtype == solution.residuals.energy.dtype == jnp.float32
-    mixed = solve_contacts(replace(problem, approach=problem.approach.astype(float)), 0.5, solver=BarzilaiBorwein(1e-4))
+    mixed = solve_contacts(
+        replace(problem, approach=problem.approach.astype(float)), 0.5, solver=BarzilaiBorwein(1e-4)
+    )
     assert mixed.impulses.dtype == float
 
 
@@ -162,7 +194,9 @@ def test_batch_has_the_results_of_its_problems_one_by_one(sparse):
     batch = jax.tree.map(lambda *x: jnp.stack(x), *several)
     if sparse:
         batch = replace(batch, matrix=BCOO.fromdense(batch.matrix, n_batch=1))
-    together = jax.vmap(partial(solve_contacts, solver=BarzilaiBorwein(1e-8, 20_000)))(batch, jnp.full(4, 0.5))
+    together = jax.vmap(partial(solve_contacts, solver=BarzilaiBorwein(1e-8, 20_000)))(
+        batch, jnp.full(4, 0.5)
+    )
     assert together.status.tolist() == [Status.ok, Status.infeasible, Status.nonfinite, Status.ok]
     for k in (0, 3):
         alone = solve_contacts(several[k], 0.5, solver=BarzilaiBorwein(1e-8, 20_000))
@@ -177,10 +211,14 @@ def test_derivatives_of_a_network_are_those_of_finite_differences():
         fields = {name: value for name, value in at.items() if name != "restitution"}
         return weighted(weights, replace(network, **fields), at["restitution"])
 
-    at = {name: getattr(network, name) for name in ("approach", "masses", "normals")} | {"restitution": jnp.array(0.3)}
+    at = {name: getattr(network, name) for name in ("approach", "masses", "normals")} | {
+        "restitution": jnp.array(0.3)
+    }
     along = {name: random_like(value, 1) for name, value in at.items()}
     along["masses"] = along["masses"] * network.masses
-    along["normals"] = jnp.where(network.normals != 0, along["normals"], 0)  # unused slots stay unused
+    along["normals"] = jnp.where(
+        network.normals != 0, along["normals"], 0
+    )  # unused slots stay unused
     assert_derivatives(function, at, along)
 
 
@@ -193,7 +231,11 @@ def test_derivatives_of_a_matrix_are_those_of_finite_differences(form):
         changed = problem.matrix + at["change"] + at["change"].T
         return weighted(weights, DelassusProblem(form(changed), at["approach"]), at["restitution"])
 
-    at = {"change": jnp.zeros((SIZE, SIZE)), "approach": problem.approach, "restitution": jnp.array(0.3)}
+    at = {
+        "change": jnp.zeros((SIZE, SIZE)),
+        "approach": problem.approach,
+        "restitution": jnp.array(0.3),
+    }
     assert_derivatives(function, at, {name: random_like(value, 1) for name, value in at.items()})
 
 
@@ -208,9 +250,13 @@ def weighted(weights, problem, restitution):
 
 
 def assert_derivatives(function, at, along, step=1e-6):
-    """The slope along a direction, in forward and in reverse mode, is that of a central difference."""
+    """The slope along a direction, in forward and in reverse mode, is that of a central
+    difference.
+    """
     function = jax.jit(function)
-    up, down = (function(jax.tree.map(lambda x, d, s=s: x + s * d, at, along)) for s in (step, -step))
+    up, down = (
+        function(jax.tree.map(lambda x, d, s=s: x + s * d, at, along)) for s in (step, -step)
+    )
     slope = jax.grad(function)(at)
     reverse = sum(float(jnp.sum(slope[name] * along[name])) for name in at)
     forward = jax.jvp(function, (at,), (along,))[1]
@@ -220,16 +266,21 @@ def assert_derivatives(function, at, along, step=1e-6):
 def test_large_sparse_matrix_is_judged_and_solved_without_a_dense_copy():
     count = 5000
     row = scipy.sparse.diags_array(
-        [np.full(count, 2.0), np.full(count - 1, -1.0), np.full(count - 1, -1.0)], offsets=(0, 1, -1)
+        [np.full(count, 2.0), np.full(count - 1, -1.0), np.full(count - 1, -1.0)],
+        offsets=(0, 1, -1),
     )
     approach = np.zeros(count)
     approach[0] = -1
-    solution = solve_contacts(DelassusProblem(row, jnp.asarray(approach)), solver=BarzilaiBorwein(1e-6, 300))
+    solution = solve_contacts(
+        DelassusProblem(row, jnp.asarray(approach)), solver=BarzilaiBorwein(1e-6, 300)
+    )
     assert solution.residuals.natural_map < 0.1  # a shock that has come 300 discs far
     with pytest.raises(InputError, match="negative eigenvalue"):
         solve_contacts(
             DelassusProblem(
-                row - 3.0 * scipy.sparse.eye_array(count, k=1) - 3.0 * scipy.sparse.eye_array(count, k=-1),
+                row
+                - 3.0 * scipy.sparse.eye_array(count, k=1)
+                - 3.0 * scipy.sparse.eye_array(count, k=-1),
                 jnp.asarray(approach),
             )
         )

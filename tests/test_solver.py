@@ -1,4 +1,6 @@
-"""Contact solves: against dense matrices and exact solutions, and what happens where there is no solution."""
+"""Contact solves: against dense matrices and exact solutions, and what happens where there is no
+solution.
+"""
 
 from dataclasses import replace
 
@@ -25,8 +27,12 @@ compiled_product = jax.jit(delassus_product, static_argnums=2)
 compiled_impulses = jax.jit(grain_impulses, static_argnums=2)
 
 
-def velocities_after(network: Contacts, masses: np.ndarray, velocities: np.ndarray, impulses) -> np.ndarray:
-    return velocities + np.asarray(compiled_impulses(network, impulses, MAX_DISCS)) / masses[:, None]
+def velocities_after(
+    network: Contacts, masses: np.ndarray, velocities: np.ndarray, impulses
+) -> np.ndarray:
+    return (
+        velocities + np.asarray(compiled_impulses(network, impulses, MAX_DISCS)) / masses[:, None]
+    )
 
 
 @settings(max_examples=30)
@@ -42,10 +48,15 @@ def test_delassus_operator_never_exceeds_its_bound(network_of, heaviest):
 @given(networks)
 def test_delassus_product_equals_the_dense_matrix(network_of):
     network, masses, _ = random_network(*network_of)
-    impulses = np.random.default_rng(network_of[0]).normal(size=network.used.size)  # unused slots too: they are inert
+    impulses = np.random.default_rng(network_of[0]).normal(
+        size=network.used.size
+    )  # unused slots too: they are inert
     matrix = delassus(network, masses)
     rounding = 16 * EPS * (np.abs(matrix) @ np.abs(impulses))
-    assert np.all(np.abs(compiled_product(network, jnp.asarray(impulses), MAX_DISCS) - matrix @ impulses) <= rounding)
+    assert np.all(
+        np.abs(compiled_product(network, jnp.asarray(impulses), MAX_DISCS) - matrix @ impulses)
+        <= rounding
+    )
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -62,10 +73,16 @@ def test_velocities_equal_the_exact_solution(solved, method, network_of, heavies
 @pytest.mark.parametrize("method", METHODS)
 @settings(max_examples=20)
 @given(networks, st.sampled_from([1e-3, 1e-6, 1e-10]))
-def test_impulses_push_and_are_complementary_to_the_velocities_after(solved, method, network_of, tolerance):
+def test_impulses_push_and_are_complementary_to_the_velocities_after(
+    solved, method, network_of, tolerance
+):
     network, masses, _ = random_network(*network_of)
     solution = solved(network, tolerance, method=method)
-    matrix, impulses, approach = delassus(network, masses), np.asarray(solution.impulses), np.asarray(network.approach)
+    matrix, impulses, approach = (
+        delassus(network, masses),
+        np.asarray(solution.impulses),
+        np.asarray(network.approach),
+    )
     assert solution.status == Status.ok
     assert np.all(impulses >= 0)
     rounding = 32 * EPS * np.linalg.norm(np.abs(matrix) @ impulses + np.abs(approach))
@@ -114,17 +131,27 @@ def test_cap_of_iterations_returns_the_best_iterate(solved, method):
             assert solution.status == Status.iteration_limit
             assert solution.iterations == cap
             matrix, impulses = delassus(network, masses), np.asarray(solution.impulses)
-            residual = np.linalg.norm(np.minimum(np.diag(matrix) * impulses, matrix @ impulses + network.approach))
-            np.testing.assert_allclose(solution.residual * np.linalg.norm(np.minimum(network.approach, 0)), residual)
+            residual = np.linalg.norm(
+                np.minimum(np.diag(matrix) * impulses, matrix @ impulses + network.approach)
+            )
+            np.testing.assert_allclose(
+                solution.residual * np.linalg.norm(np.minimum(network.approach, 0)), residual
+            )
             residuals.append(residual)
         assert np.all(np.diff(residuals) <= 0)
 
 
 def squeezed(grains: int) -> Contacts:
-    """A row of grains closed through the periodic boundary, all of whose contacts approach: no impulses stop them."""
+    """A row of grains closed through the periodic boundary, all of whose contacts approach: no
+    impulses stop them.
+    """
     i = np.arange(grains)
     return padded_network(
-        i, (i + 1) % grains, np.tile([1.0, 0.0], (grains, 1)), np.full(grains, -1.0), np.ones(MAX_DISCS)
+        i,
+        (i + 1) % grains,
+        np.tile([1.0, 0.0], (grains, 1)),
+        np.full(grains, -1.0),
+        np.ones(MAX_DISCS),
     )
 
 

@@ -1,4 +1,6 @@
-"""Contact solvers side by side: problems as others pose them, what is judged and counted, and the figure."""
+"""Contact solvers side by side: problems as others pose them, what is judged and counted, and the
+figure.
+"""
 
 import numpy as np
 import pytest
@@ -27,4 +29,6 @@ def test_solution_is_optimal_for_the_quadratic_program(entries):
         slope = program.scale * (program.p @ (entry.solution.impulses / program.scale) + program.q)
         np.testing.assert_allclose(slope, entry.solution.velocities, atol=1e-12)
         g = weighted(entry)
-        np.testing.assert_allclose((g @ g.T).toarray(), delassus(entry.problem).toarray(), atol=1e-12)
+        np.testing.assert_allclose(
+            (g @ g.T).toarray(), delassus(entry.problem).toarray(), atol=1e-12
+        )

@@ -1,4 +1,6 @@
-"""Where the time step, the packing fraction and the precision fail, every failure is flagged or refused."""
+"""Where the time step, the packing fraction and the precision fail, every failure is flagged or
+refused.
+"""
 
 from functools import cache
 
@@ -16,7 +18,9 @@ pack = jax.jit(stability.pack)
 
 @pytest.mark.parametrize("packing_fraction", [0.82, 0.835])
 def test_dense_flow_converges_or_is_flagged(packing_fraction: float) -> None:
-    """Beside jamming at 0.8386: what is called ok is solved, hardly overlaps and is finite, and no energy appears."""
+    """Beside jamming at 0.8386: what is called ok is solved, hardly overlaps and is finite, and no
+    energy appears.
+    """
     state, _ = warm(0.0, packing_fraction)
     flow = stability.flow_of("default", 0.0, packing_fraction, timestep=3e-4)
     before = stability.energy(state)

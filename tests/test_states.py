@@ -1,4 +1,6 @@
-"""The last states of a map are those of its flows, cost its numbers nothing, and survive every file."""
+"""The last states of a map are those of its flows, cost its numbers nothing, and survive every
+file.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +21,9 @@ from jaxgran.maps.states import first_of_points, instant_at, states_of
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.status import Status
 
-SETTINGS = MapSettings((0.5, 0.9), (0.8,), grains=32, seeds=2, timestep=5e-4, equilibrate=0.5, strain=1.6)
+SETTINGS = MapSettings(
+    (0.5, 0.9), (0.8,), grains=32, seeds=2, timestep=5e-4, equilibrate=0.5, strain=1.6
+)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +44,9 @@ def test_forces_of_a_state_act_between_grains_that_touch(with_states) -> None:
         assert np.pi * np.sum(state.grains.radii**2) / state.side**2 == pytest.approx(0.8)
         found = instant_at(state, SETTINGS.restitution[point], 0.8, 5e-4, "midpoint")
         i, j = found.pairs.T
-        apart = np.hypot(*minimum_image(found.positions[i] - found.positions[j], found.side, found.tilt).T)
+        apart = np.hypot(
+            *minimum_image(found.positions[i] - found.positions[j], found.side, found.tilt).T
+        )
         near = found.radii[i] + found.radii[j] + 5e-4 * (found.speed[i] + found.speed[j] + 2)
         assert np.all(found.force > 0) and np.all(apart < near)
         pairs += len(found.force)
@@ -57,10 +63,16 @@ def test_bad_replicas_give_no_state(with_states) -> None:
 
 
 def kept(settings: MapSettings) -> dict[Key, Replica]:
-    """Made-up replicas of a map; one point has no state, and they have different numbers of grains."""
+    """Made-up replicas of a map; one point has no state, and they have different numbers of
+    grains.
+    """
     rng = np.random.default_rng(0)
     found = {(point, 0): random_state(point, 20 + point) for point in (0, 1, 3)}
-    return {(p, s): random_replica(rng, settings)._replace(state=found.get((p, s))) for p in range(4) for s in (0, 1)}
+    return {
+        (p, s): random_replica(rng, settings)._replace(state=found.get((p, s)))
+        for p in range(4)
+        for s in (0, 1)
+    }
 
 
 def test_a_file_has_the_state_of_each_point(tmp_path: Path) -> None:
@@ -69,7 +81,9 @@ def test_a_file_has_the_state_of_each_point(tmp_path: Path) -> None:
     write_dataset(map_dataset(settings, written, {}), tmp_path / "map.nc")
     data = open_map(tmp_path / "map.nc")
     assert data["states"].positions.dims == ("packing_fraction", "restitution", "grain", "axis_a")
-    assert all(one.attrs["long_name"] and one.attrs["units"] for one in data["states"].data_vars.values())
+    assert all(
+        one.attrs["long_name"] and one.attrs["units"] for one in data["states"].data_vars.values()
+    )
     found, expected = states_of(data["states"].to_dataset(), 4), first_of_points(written)
     assert set(found) == set(expected) == {0, 1, 3}
     for point, state in expected.items():
@@ -78,11 +92,17 @@ def test_a_file_has_the_state_of_each_point(tmp_path: Path) -> None:
     assert "states" not in map_dataset(replace(settings, snapshots=False), written, {}).children
 
 
-def test_state_of_a_batch_that_continues_from_its_journal_is_the_same(with_states, tmp_path: Path, monkeypatch) -> None:
+def test_state_of_a_batch_that_continues_from_its_journal_is_the_same(
+    with_states, tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.setattr("jaxgran.maps.journal.SECONDS", 0.0)
     for journal_there in (False, True):
         assert (tmp_path / "journal.nc").exists() == journal_there
-        done = dict(run_replicas_module._run_task(replace(SETTINGS, snapshots=True), [(1, 0)], tmp_path / "journal.nc"))
+        done = dict(
+            run_replicas_module._run_task(
+                replace(SETTINGS, snapshots=True), [(1, 0)], tmp_path / "journal.nc"
+            )
+        )
         jax.tree.map(np.testing.assert_array_equal, done[1, 0], with_states[1, 0])
 
 

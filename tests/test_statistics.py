@@ -8,7 +8,13 @@ from scipy.special import stdtrit
 
 from jaxgran import statistics
 from jaxgran.model.flow import steps_of_blocks
-from jaxgran.statistics import correlation_length, drift, error_correlation, jackknife, standard_errors
+from jaxgran.statistics import (
+    correlation_length,
+    drift,
+    error_correlation,
+    jackknife,
+    standard_errors,
+)
 
 TRIALS = 400
 
@@ -50,15 +56,20 @@ def test_error_of_a_ratio_of_sums_is_that_of_the_delta_method(merge: int, monkey
     # Var R = Var(x − R y) / (n ⟨y⟩²); here x − R y has the standard deviation 2, and ⟨y⟩ = 10.
     monkeypatch.setattr(statistics, "BLOCK_MERGES", (merge,))
     rng, seeds, blocks = np.random.default_rng(1), 4, 32
-    variances = np.array([error_of_ratio(correlated_blocks(rng, seeds, blocks)) ** 2 for _ in range(TRIALS)])
+    variances = np.array(
+        [error_of_ratio(correlated_blocks(rng, seeds, blocks)) ** 2 for _ in range(TRIALS)]
+    )
     expected = 2.0**2 / (seeds * blocks * 10.0**2)
-    assert abs(variances.mean() - expected) < 4 * variances.std() / np.sqrt(TRIALS) + 0.01 * expected
+    assert (
+        abs(variances.mean() - expected) < 4 * variances.std() / np.sqrt(TRIALS) + 0.01 * expected
+    )
 
 
 def test_merging_correlated_blocks_enlarges_the_error_as_much_as_their_correlation_asks(
     monkeypatch,
 ) -> None:
-    # A mean of four values of an AR(1) process with ρ = ½ has (4 + 6ρ + 4ρ² + 2ρ³)/4 times the variance of white noise.
+    # A mean of four values of an AR(1) process with ρ = ½ has (4 + 6ρ + 4ρ² + 2ρ³)/4 times the
+    # variance of white noise.
     rng = np.random.default_rng(3)
     series = ar1(rng, (TRIALS, 64), 0.5)[:, None, :]
     mean_variance = {}
@@ -67,7 +78,9 @@ def test_merging_correlated_blocks_enlarges_the_error_as_much_as_their_correlati
         variances = [error_of_ratio({"over": x, "under": np.ones_like(x)}) ** 2 for x in series]
         mean_variance[merge] = np.mean(variances)
     expected = (4 + 6 * 0.5 + 4 * 0.25 + 2 * 0.125) / 4
-    assert mean_variance[4] / mean_variance[1] == pytest.approx(expected, rel=0.1)  # 4 % standard error
+    assert mean_variance[4] / mean_variance[1] == pytest.approx(
+        expected, rel=0.1
+    )  # 4 % standard error
 
 
 def test_merged_blocks_never_span_two_seeds(monkeypatch) -> None:
@@ -88,7 +101,9 @@ def test_a_single_block_has_no_error(seeds: int, known: bool) -> None:
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.6, 0.8])
 def test_correlation_length_is_that_of_the_process(correlation: float) -> None:
-    """An AR(1) series of n values is worth n (1 − φ)/(1 + φ) samples. Long series: a short one shows less."""
+    """An AR(1) series of n values is worth n (1 − φ)/(1 + φ) samples. Long series: a short one
+    shows less.
+    """
     rng, lengths = np.random.default_rng(6), []
     for _ in range(60):
         sums = {"over": ar1(rng, (4, 256), correlation), "under": np.ones((4, 256))}
@@ -126,8 +141,12 @@ def error_of_mean(series: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("seeds", [1, 2, 4, 8])
 @pytest.mark.parametrize("memory", [0.01, 0.5, 1.0, 2.0])
-def test_intervals_hold_if_a_seed_is_sixteen_times_as_long_as_its_memory(memory: float, seeds: int) -> None:
-    """95 % intervals of 32 blocks hold in 92 to 98 % of the trials, and are at most 1.3 times as wide as the true."""
+def test_intervals_hold_if_a_seed_is_sixteen_times_as_long_as_its_memory(
+    memory: float, seeds: int
+) -> None:
+    """95 % intervals of 32 blocks hold in 92 to 98 % of the trials, and are at most 1.3 times as
+    wide as the true.
+    """
     correlation, trials = np.exp(-1 / memory), 1000
     rng = np.random.default_rng(9)
     series = np.stack([ar1(rng, (trials, 32), correlation).T for _ in range(seeds)])
@@ -140,8 +159,12 @@ def test_intervals_hold_if_a_seed_is_sixteen_times_as_long_as_its_memory(memory:
 
 
 @pytest.mark.parametrize("memory", [0.3, 8.0])
-def test_intervals_of_seeds_of_unequal_length_are_those_of_one_correlation_time(memory: float) -> None:
-    """Sixteen short seeds, whose blocks are correlated, and one of eight times the length, whose blocks are not."""
+def test_intervals_of_seeds_of_unequal_length_are_those_of_one_correlation_time(
+    memory: float,
+) -> None:
+    """Sixteen short seeds, whose blocks are correlated, and one of eight times the length, whose
+    blocks are not.
+    """
     rng, lengths, found = np.random.default_rng(0), [1] * 16 + [8], []
     for _ in range(TRIALS):
         series = [ar1(rng, (1, 32 * length), np.exp(-1 / memory)) for length in lengths]
@@ -155,11 +178,15 @@ def test_intervals_of_seeds_of_unequal_length_are_those_of_one_correlation_time(
 
 
 def test_interval_is_that_of_the_posterior_integrated_by_brute_force() -> None:
-    """The likelihood of eight Gaussian values, summed over the mean, ln σ, the memory and the white share."""
+    """The likelihood of eight Gaussian values, summed over the mean, ln σ, the memory and the white
+    share.
+    """
     x = ar1(np.random.default_rng(10), (2, 4), 0.5) + 3.0
     lag = np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
     half = 1.959964 * error_of_mean(x)
-    means = half * np.sinh(np.linspace(-9, 9, 3601))  # less the plain mean; even in a scale that reaches far
+    means = half * np.sinh(
+        np.linspace(-9, 9, 3601)
+    )  # less the plain mean; even in a scale that reaches far
     spacing = np.hypot(means, half)
     log_deviation = np.linspace(-4, 9, 131)[:, None]
     mass = np.zeros(means.size)
@@ -168,7 +195,9 @@ def test_interval_is_that_of_the_posterior_integrated_by_brute_force() -> None:
             correlation = (1 - white) * np.exp(-lag / memory) + white * np.eye(4)
             residuals = (x - x.mean())[:, :, None] - means
             square = np.einsum("sim,ij,sjm->m", residuals, np.linalg.inv(correlation), residuals)
-            likelihood = np.exp(-square * np.exp(-2 * log_deviation) / 2 - 8 * log_deviation).sum(axis=0)
+            likelihood = np.exp(-square * np.exp(-2 * log_deviation) / 2 - 8 * log_deviation).sum(
+                axis=0
+            )
             prior = memory**0.25 / (1 + (memory / 2.5) ** 2)
             mass += prior * likelihood / np.linalg.det(correlation)  # two seeds
     mass *= spacing
@@ -180,7 +209,9 @@ def test_seeds_of_one_block_are_independent_and_have_the_error_of_student() -> N
     for seeds in (2, 3, 10, 200):
         values = np.random.default_rng(seeds).normal(size=(seeds, 1))
         usual = values.std(ddof=1) / np.sqrt(seeds)
-        assert error_of_mean(values) == pytest.approx(usual * stdtrit(seeds - 1, 0.975) / 1.959964, rel=1e-4)
+        assert error_of_mean(values) == pytest.approx(
+            usual * stdtrit(seeds - 1, 0.975) / 1.959964, rel=1e-4
+        )
 
 
 @given(
@@ -208,11 +239,16 @@ def test_standard_error_of_a_ratio_of_sums_is_the_spread_of_many_samples() -> No
 
 
 def test_blocks_that_differ_by_a_step_have_the_error_of_all_their_steps() -> None:
-    """White noise of each step, in blocks of five and six steps, as those of a strain that 32 blocks do not divide."""
+    """White noise of each step, in blocks of five and six steps, as those of a strain that 32
+    blocks do not divide.
+    """
     rng, steps = np.random.default_rng(12), steps_of_blocks(np.array(176.0), 32)
     assert set(steps.tolist()) == {5, 6}
     noise = np.sqrt(steps)[:, None] * rng.normal(size=(2, 32, TRIALS))
-    sums = {"over": steps[:, None] * 3 + noise, "under": np.broadcast_to(steps[:, None], noise.shape)}
+    sums = {
+        "over": steps[:, None] * 3 + noise,
+        "under": np.broadcast_to(steps[:, None], noise.shape),
+    }
     value, error = standard_errors(ratio, sums)
     expected = 1 / np.sqrt(2 * 176)
     assert np.std(value["ratio"]) == pytest.approx(expected, rel=4 / np.sqrt(2 * TRIALS))
@@ -221,7 +257,9 @@ def test_blocks_that_differ_by_a_step_have_the_error_of_all_their_steps() -> Non
 
 
 def test_errors_of_two_averages_are_correlated_as_their_blocks_are() -> None:
-    """A correlation of n blocks scatters by (1 - ρ²)/√n; that of an average with its reciprocal is -1."""
+    """A correlation of n blocks scatters by (1 - ρ²)/√n; that of an average with its reciprocal is
+    -1.
+    """
     rng, correlation, blocks = np.random.default_rng(15), 0.6, (4, 32)
     first, other = rng.normal(10, 1, (2, *blocks))
     second = 10 + correlation * (first - 10) + np.sqrt(1 - correlation**2) * (other - 10)
@@ -247,16 +285,22 @@ def test_error_of_equal_blocks_and_of_an_unknown_value_is_unknown() -> None:
 
 
 def test_error_of_values_that_differ_by_rounding_is_unknown() -> None:
-    """Where two seeds are equal to the last bit the posterior has no width. Warnings are errors here."""
+    """Where two seeds are equal to the last bit the posterior has no width. Warnings are errors
+    here.
+    """
     for rng in map(np.random.default_rng, range(40)):
         under = np.ones((2, 40, 20))
-        _, error = standard_errors(ratio, {"over": under + 1e-15 * rng.normal(size=under.shape), "under": under})
+        _, error = standard_errors(
+            ratio, {"over": under + 1e-15 * rng.normal(size=under.shape), "under": under}
+        )
         assert np.isnan(error["ratio"]).all()
 
 
 def test_drift_of_a_step_is_its_height() -> None:
     assert drift(np.repeat([1.0, 3.5], 10)) == (2.5, 0.0)
-    assert drift(np.array([0.0, 0.0, 9.0, 1.0, 1.0]))[0] == 1.0  # the middle of an odd series is left out
+    assert (
+        drift(np.array([0.0, 0.0, 9.0, 1.0, 1.0]))[0] == 1.0
+    )  # the middle of an odd series is left out
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.6])
@@ -288,5 +332,7 @@ def test_largest_error_of_all_merges_is_taken(monkeypatch) -> None:
 
 
 def test_error_of_a_drift_of_four_values_takes_two_means_from_them() -> None:
-    """Each half has one degree of freedom: σ² is estimated by Σ (x − mean)² / 2, and both means have half of it."""
+    """Each half has one degree of freedom: σ² is estimated by Σ (x − mean)² / 2, and both means
+    have half of it.
+    """
     assert drift(np.array([0.0, 2.0, 5.0, 7.0])) == (5.0, pytest.approx(np.sqrt(4 / 2)))

@@ -1,4 +1,6 @@
-"""A file is there whole or not at all, and one that is not what was written is known to be damaged."""
+"""A file is there whole or not at all, and one that is not what was written is known to be
+damaged.
+"""
 
 import hashlib
 from pathlib import Path

@@ -1,4 +1,6 @@
-"""Structure of known point sets, networks and forces is found again, and that of a flow obeys the laws of shear."""
+"""Structure of known point sets, networks and forces is found again, and that of a flow obeys the
+laws of shear.
+"""
 
 import jax
 import numpy as np
@@ -24,7 +26,9 @@ def flow() -> ShearFlow:
 
 @pytest.fixture(scope="module")
 def seen(flow, flowing) -> Snapshot:
-    return series(snapshot_series(flow, flowing(0.75), 200.0, SNAPSHOTS, solver=BarzilaiBorwein(1e-8))[1])
+    return series(
+        snapshot_series(flow, flowing(0.75), 200.0, SNAPSHOTS, solver=BarzilaiBorwein(1e-8))[1]
+    )
 
 
 CHAIN_AND_PAIR = [(0, 1, 2.0), (2, 1, 1.0), (3, 4, 1.0), (4, 5, 0.0)]
@@ -35,7 +39,10 @@ def test_a_chain_of_three_and_a_pair() -> None:
     seen = snapshot_of(ROW[None], [CHAIN_AND_PAIR])
     found = clusters(seen)
     np.testing.assert_array_equal(found.sizes, [[3, 3, 3, 2, 2, 1, 1]])
-    assert len(set(found.labels[0, :3])) == 1 and found.labels[0, 3] == found.labels[0, 4] != found.labels[0, 0]
+    assert (
+        len(set(found.labels[0, :3])) == 1
+        and found.labels[0, 3] == found.labels[0, 4] != found.labels[0, 0]
+    )
     carried = cluster_share(seen)
     np.testing.assert_allclose(carried.contacts.value, 2 / 3)
     np.testing.assert_allclose([carried.force.value, carried.pressure.value], 3 / 4)
@@ -44,7 +51,9 @@ def test_a_chain_of_three_and_a_pair() -> None:
 def test_shares_of_shear_stress_follow_the_directions_of_contacts() -> None:
     slanted = np.array([[1, 1], [1.6, 0.2], [2.2, -0.6], [5, 5], [5.6, 5.8]])
     share = cluster_share(snapshot_of(slanted[None], [[(0, 1, 1.0), (1, 2, 1.0), (3, 4, 0.5)]]))
-    np.testing.assert_allclose(share.shear_stress.value, 2 / 1.5)  # the pair is loaded the other way
+    np.testing.assert_allclose(
+        share.shear_stress.value, 2 / 1.5
+    )  # the pair is loaded the other way
     np.testing.assert_allclose(share.pressure.value, 2 / 2.5)
 
 
@@ -68,7 +77,9 @@ def test_clusters_of_two_are_binary_collisions(flow, seen) -> None:
     binary = (1 + flow.restitution) * reduced * -contacts.approach[slot] / flow.timestep
     alone = sizes[load.time, load.i] == 2
     assert alone.sum() > 100 and (~alone).sum() > 100
-    np.testing.assert_allclose(load.force[alone], binary[alone], rtol=1e-4, atol=1e-6 * binary.mean())
+    np.testing.assert_allclose(
+        load.force[alone], binary[alone], rtol=1e-4, atol=1e-6 * binary.mean()
+    )
     share = cluster_share(seen)
     excess = load.force[~alone].sum() / binary[~alone].sum() - 1
     assert excess > 0.1 and 0.2 < share.force.value < 0.95

@@ -1,4 +1,6 @@
-"""A table fits the terminal in pages that name their rows, and the letters that the terminal has."""
+"""A table fits the terminal in pages that name their rows, and the letters that the terminal
+has.
+"""
 
 import sys
 from contextlib import redirect_stdout
@@ -24,7 +26,9 @@ def printed(table: Table) -> str:
 
 
 @pytest.mark.parametrize("width", [40, 80, 120])
-def test_every_page_fits_the_terminal_names_its_rows_and_loses_nothing(width: int, monkeypatch) -> None:
+def test_every_page_fits_the_terminal_names_its_rows_and_loses_nothing(
+    width: int, monkeypatch
+) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
     out = printed(MAP)
     assert max(map(len, out.splitlines())) <= width and "…" not in out
@@ -45,4 +49,6 @@ def test_letters_that_a_terminal_lacks_are_written_in_others(monkeypatch) -> Non
     out = content.getvalue().decode("ascii")
     assert out.startswith("sigmagamma-dot ... ?\n")
     lines = [line for line in out.splitlines() if line.startswith("| ")]
-    assert "6.6000 +- 0.0019" in out and len({len(line) for line in lines}) == 1  # columns stay straight
+    assert (
+        "6.6000 +- 0.0019" in out and len({len(line) for line in lines}) == 1
+    )  # columns stay straight

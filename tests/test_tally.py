@@ -34,7 +34,9 @@ def test_joined_sample_has_the_sums_and_the_larger_of_each_extreme():
         joined = one + two
         for name in TABLE:
             expected = np.maximum if name in EXTREMES else np.add
-            np.testing.assert_array_equal(getattr(joined, name), expected(getattr(one, name), getattr(two, name)))
+            np.testing.assert_array_equal(
+                getattr(joined, name), expected(getattr(one, name), getattr(two, name))
+            )
             assert getattr(joined, name).dtype == getattr(one, name).dtype
 
 
@@ -45,14 +47,19 @@ def test_tally_of_no_time_is_neutral():
 
 
 def test_sums_of_a_users_function_are_joined_and_stored_with_the_others():
-    one, two = (replace(random_tally(seed), observed={"a": np.float64(seed), "b": np.ones(3)}) for seed in (4, 5))
+    one, two = (
+        replace(random_tally(seed), observed={"a": np.float64(seed), "b": np.ones(3)})
+        for seed in (4, 5)
+    )
     joined = one + two
     assert joined.observed["a"] == 9
     np.testing.assert_array_equal(joined.observed["b"], [2, 2, 2])
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), one.observed)
     stored = np.append(flat_tally(one, ()), 7.0)  # a number of something else behind it
     again = tally_from_flat(stored[None], np.dtype(float), shapes)
-    jax.tree.map(np.testing.assert_array_equal, again, jax.tree.map(lambda x: np.asarray(x)[None], one))
+    jax.tree.map(
+        np.testing.assert_array_equal, again, jax.tree.map(lambda x: np.asarray(x)[None], one)
+    )
 
 
 def test_running_sums_follow_each_other_without_a_gap():
@@ -63,10 +70,24 @@ def test_running_sums_follow_each_other_without_a_gap():
 
 def test_terms_of_a_contact_stand_where_the_table_says():
     rng = np.random.default_rng(0)
-    angle, distance, overlap, approach, half_change, one_plus_alpha, p, binary, clustered = rng.uniform(0.1, 1, 9)
+    angle, distance, overlap, approach, half_change, one_plus_alpha, p, binary, clustered = (
+        rng.uniform(0.1, 1, 9)
+    )
     nx, ny = np.cos(angle), np.sin(angle)
     terms = contact_terms(
-        nx, ny, distance, overlap, approach, half_change, one_plus_alpha, p, binary, clustered, 1, 2, 3
+        nx,
+        ny,
+        distance,
+        overlap,
+        approach,
+        half_change,
+        one_plus_alpha,
+        p,
+        binary,
+        clustered,
+        1,
+        2,
+        3,
     )
     moment = distance * np.array([nx * nx, nx * ny, ny * ny])
     after = approach + 2 * half_change

@@ -1,4 +1,6 @@
-"""Errors of the theory, shares of the clusters and laws of dense flow are drawn as numbers at their places."""
+"""Errors of the theory, shares of the clusters and laws of dense flow are drawn as numbers at their
+places.
+"""
 
 from pathlib import Path
 
@@ -23,11 +25,14 @@ from jaxgran.plotting.theory import ERROR_LEVELS, cluster_shares, error_parts, t
 
 
 def panel(figure: Figure, name: str) -> Axes:
-    """Return the axes of the shares of pressure "p" or shear stress "s", or those of the map "m"."""
+    """Return the axes of the shares of pressure "p" or shear stress "s", or those of the map
+    "m".
+    """
     return {axes.get_label(): axes for axes in figure.axes}[name]
 
 
-# ---------------------------------------------------------------------------------------------- theory
+# ----------------------------------------------------------------------------------------------
+# theory
 
 
 @pytest.mark.parametrize("quantity", ["pressure", "shear_stress"])
@@ -58,13 +63,16 @@ def test_errors_lie_on_their_isolines() -> None:
         for axes, law in zip(row, laws, strict=True):
             lines = contour_lines(axes, "black")
             corners = law(*np.meshgrid([0.1, 0.9], [0.3, 0.8]))
-            reached = {level for level in ERROR_LEVELS.values() if corners.min() < level < corners.max()}
+            reached = {
+                level for level in ERROR_LEVELS.values() if corners.min() < level < corners.max()
+            }
             assert set(lines) <= reached and len(lines) >= 3  # a short one lies under its label
             for level, vertices in lines.items():
                 np.testing.assert_allclose(law(*vertices.T), level, atol=1e-9)
 
 
-# ---------------------------------------------------------------------------------------------- factors
+# ----------------------------------------------------------------------------------------------
+# factors
 
 
 def test_factors_lie_on_their_isolines() -> None:
@@ -73,13 +81,18 @@ def test_factors_lie_on_their_isolines() -> None:
     for k, axes in enumerate(figure.axes):
         corners = factor_of(k, *np.meshgrid([0.1, 0.9], [0.3, 0.8]))
         lines = contour_lines(axes, "black")
-        reached = {level for level in ERROR_LEVELS.values() if corners.min() < level < corners.max()}
-        assert set(lines) <= reached and len(lines) >= min(1, len(reached))  # a short one lies under its label
+        reached = {
+            level for level in ERROR_LEVELS.values() if corners.min() < level < corners.max()
+        }
+        assert set(lines) <= reached and len(lines) >= min(
+            1, len(reached)
+        )  # a short one lies under its label
         for level, vertices in lines.items():
             np.testing.assert_allclose(factor_of(k, *vertices.T), level, atol=1e-9)
 
 
-# -------------------------------------------------------------------------------------------- clusters
+# --------------------------------------------------------------------------------------------
+# clusters
 
 
 def test_shares_stand_at_their_excess_with_errors_in_both_directions() -> None:
@@ -102,10 +115,13 @@ def test_shares_stand_at_their_excess_with_errors_in_both_directions() -> None:
         assert left < drawn[..., 0].min() and drawn[..., 0].max() < right
 
 
-# --------------------------------------------------------------------------------------------- together
+# ---------------------------------------------------------------------------------------------
+# together
 
 
-@pytest.mark.parametrize("draw", [ratio_curves, ratio_contours, theory_errors, enskog_factors, cluster_shares])
+@pytest.mark.parametrize(
+    "draw", [ratio_curves, ratio_contours, theory_errors, enskog_factors, cluster_shares]
+)
 def test_map_without_any_value_is_drawn(draw) -> None:
     data = theory_dataset()
     empty = data.assign({name: np.nan * data[name] for name in data if name != "status"})
@@ -119,9 +135,14 @@ def test_map_without_any_value_is_drawn(draw) -> None:
     [
         (theory_dataset(3, 3), ["curves", "contours", "theory", "factors", "clusters"]),
         (theory_dataset(1, 3), ["curves", "clusters"]),
-        (theory_dataset(3, 3).drop_vars("theory/pressure"), ["curves", "contours", "factors", "clusters"]),
         (
-            theory_dataset(3, 3).drop_vars("theory/enskog_factor_pressure_local_temperature"),  # made before
+            theory_dataset(3, 3).drop_vars("theory/pressure"),
+            ["curves", "contours", "factors", "clusters"],
+        ),
+        (
+            theory_dataset(3, 3).drop_vars(
+                "theory/enskog_factor_pressure_local_temperature"
+            ),  # made before
             ["curves", "contours", "theory", "clusters"],
         ),
     ],

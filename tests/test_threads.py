@@ -18,7 +18,9 @@ from jaxgran.maps.run_replicas import run_replicas
 from jaxgran.maps.settings import MapSettings
 
 SECOND = 1.0
-ENDLESS = MapSettings((0.7,), (0.6,), grains=32, seeds=2, timestep=1e-3, equilibrate=0.0, strain=1e5)
+ENDLESS = MapSettings(
+    (0.7,), (0.6,), grains=32, seeds=2, timestep=1e-3, equilibrate=0.0, strain=1e5
+)
 
 
 @pytest.fixture
@@ -59,7 +61,9 @@ def test_threads_have_the_precision_of_the_caller() -> None:
             assert [found for _, found in in_threads(dtype, [()] * 2, 2, print)] == [expected] * 2
 
 
-def test_an_error_is_raised_with_its_traceback_and_the_other_tasks_end_at_their_next_message() -> None:
+def test_an_error_is_raised_with_its_traceback_and_the_other_tasks_end_at_their_next_message() -> (
+    None
+):
     ends = []
 
     def task(number: int, send) -> None:
@@ -86,7 +90,10 @@ def test_the_threads_end_with_the_generator() -> None:
             time.sleep(0.01)
         return number
 
-    running, before = in_threads(task, [(0,), (1,), (2,)], 2, lambda _: None), threading.active_count()
+    running, before = (
+        in_threads(task, [(0,), (1,), (2,)], 2, lambda _: None),
+        threading.active_count(),
+    )
     assert next(running) == (0, 0)
     running.close()
     assert threading.active_count() == before
@@ -103,7 +110,9 @@ def test_replicas_of_hours_end_within_a_second_of_ctrl_c(ctrl_c) -> None:
     def report(advance: Advance) -> None:
         reported.append(advance)
         if len(reported) == 2:
-            threading.Timer(0.3, interrupt).start()  # in the middle of a block, of which a replica has 32
+            threading.Timer(
+                0.3, interrupt
+            ).start()  # in the middle of a block, of which a replica has 32
 
     with pytest.raises(KeyboardInterrupt):
         list(run_replicas(ENDLESS, workers=2, report=report))
@@ -123,5 +132,7 @@ threading.Thread(target=time.sleep, args=(100,), name="jaxgran-0").start()
 print("a sentence")
 end_without_threads(130)
 """
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=50)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=50
+    )
     assert (done.returncode, done.stdout, done.stderr) == (130, "a sentence\n", "")

@@ -1,4 +1,6 @@
-"""Trajectories come back bit for bit, and other programs see in them the cell, the grains and the contacts."""
+"""Trajectories come back bit for bit, and other programs see in them the cell, the grains and the
+contacts.
+"""
 
 import os
 import signal
@@ -67,7 +69,9 @@ def drive(flow, run):
 
 @pytest.fixture(scope="module")
 def recorded(flow, flowing, drive, tmp_path_factory):
-    """A file of five frames, ten steps apart, that were driven in blocks of 25 and 15 steps; and the last state."""
+    """A file of five frames, ten steps apart, that were driven in blocks of 25 and 15 steps; and
+    the last state.
+    """
     path = tmp_path_factory.mktemp("trajectory") / "flow.gsd"
     recorder = Recorder(0.0101, partial(write_frame, path))
     end, tallies = driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (25, 15))
@@ -156,7 +160,9 @@ def test_frames_are_those_of_the_flow_at_equal_distances(flow, flowing, run, rec
 
 
 @pytest.mark.parametrize("every", [0.01, 0.02], ids=["every block", "every other block"])
-def test_frames_at_the_ends_of_blocks_change_no_bit(flow, flowing, drive, every: float, tmp_path: Path) -> None:
+def test_frames_at_the_ends_of_blocks_change_no_bit(
+    flow, flowing, drive, every: float, tmp_path: Path
+) -> None:
     recorder = Recorder(every, partial(write_frame, tmp_path / "flow.gsd"))
     recorded = driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (10, 10, 10, 10))
     assert_same_bits(recorded, driven_in_blocks(drive, flow, flowing(0.78), (10, 10, 10, 10)))
@@ -179,7 +185,12 @@ def test_frames_are_at_the_nearest_time_steps_of_any_strain(flow, flowing, drive
     driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (25, 15, 60))
     assert steps == [round(10.37 * k) for k in range(10)]
     steps.clear()
-    driven_in_blocks(Recorder(1e-5, lambda _, step: steps.append(step)).recording(drive), flow, flowing(0.78), (3, 2))
+    driven_in_blocks(
+        Recorder(1e-5, lambda _, step: steps.append(step)).recording(drive),
+        flow,
+        flowing(0.78),
+        (3, 2),
+    )
     assert steps == [0, 1, 2, 3, 4, 5]
 
 
@@ -206,17 +217,24 @@ def test_forces_over_a_strain_are_the_means_over_its_time_steps_and_change_no_bi
     assert_same_bits(frame_of(read, 0), start)
     states = jax.tree.map(jnp.asarray, read.state)
     write_trajectory(again, flow, states, read.strain, force_strain=0.012, solver=EXACT)
-    expected = [mean_forces(flow, run, jax.tree.map(lambda x, k=k: x[k], states), 12) for k in range(3)]
+    expected = [
+        mean_forces(flow, run, jax.tree.map(lambda x, k=k: x[k], states), 12) for k in range(3)
+    ]
     assert sum(map(len, expected)) > 5  # pairs in contact
     for file in (path, again):
         with gsd.hoomd.open(file) as frames:
             for frame, forces in zip(frames, expected, strict=True):
                 assert [tuple(pair) for pair in frame.bonds.group.tolist()] == sorted(forces)
-                np.testing.assert_allclose(frame.log["bonds/force"], [forces[p] for p in sorted(forces)], rtol=1e-6)
+                np.testing.assert_allclose(
+                    frame.log["bonds/force"], [forces[p] for p in sorted(forces)], rtol=1e-6
+                )
                 assert frame.log["jaxgran/force_strain"][0] == pytest.approx(0.012)
                 total = frame.log["particles/contact_force"].sum()
                 np.testing.assert_allclose(total, 2 * sum(forces.values()), rtol=1e-6)
-    with pytest.raises(InputError, match=r"^force_strain must be above 0 and at most the strain between frames, 0\.02"):
+    with pytest.raises(
+        InputError,
+        match=r"^force_strain must be above 0 and at most the strain between frames, 0\.02",
+    ):
         write_trajectory(again, flow, states, read.strain, force_strain=0.03, overwrite=True)
 
 
@@ -231,12 +249,16 @@ def test_box_is_the_sheared_cell_and_holds_all_grains(seen, tilt: float, tmp_pat
     side, tilt = state.side.item(), state.tilt.item()
     box = freud.box.Box.from_box(frame.configuration.box)
     assert box.is2D and frame.particles.N == GRAINS
-    np.testing.assert_allclose(box.to_matrix()[:2, :2], [[side, tilt * side], [0, side]], rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(
+        box.to_matrix()[:2, :2], [[side, tilt * side], [0, side]], rtol=1e-6, atol=1e-7
+    )
     fractions = box.make_fractional(frame.particles.position)[:, :2]
     assert fractions.min() >= -1e-6 and fractions.max() <= 1 + 1e-6
     np.testing.assert_allclose(frame.particles.diameter, 2 * state.grains.radii, rtol=1e-6)
     np.testing.assert_allclose(frame.particles.mass, state.grains.masses, rtol=1e-6)
-    np.testing.assert_allclose(frame.particles.velocity[:, :2], state.velocities, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(
+        frame.particles.velocity[:, :2], state.velocities, rtol=1e-6, atol=1e-12
+    )
 
 
 def test_coordination_number_of_the_bonds_is_that_of_the_flow_and_clusters_are_joined_by_them(
@@ -250,16 +272,22 @@ def test_coordination_number_of_the_bonds_is_that_of_the_flow_and_clusters_are_j
     np.testing.assert_allclose(np.sum(frame.log["bonds/force"]) * 1e-3, tally.impulse, rtol=1e-9)
     bonds = coo_array((np.ones(frame.bonds.N), frame.bonds.group.T), shape=(GRAINS, GRAINS))
     _, cluster = connected_components(bonds, directed=False)
-    np.testing.assert_array_equal(frame.log["particles/cluster_size"], np.bincount(cluster)[cluster])
+    np.testing.assert_array_equal(
+        frame.log["particles/cluster_size"], np.bincount(cluster)[cluster]
+    )
     for labels in frame.log["particles/cluster"][:, None] == frame.log["particles/cluster"]:
-        assert set(np.flatnonzero(labels)) in [set(np.flatnonzero(cluster == k)) for k in set(cluster)]
+        assert set(np.flatnonzero(labels)) in [
+            set(np.flatnonzero(cluster == k)) for k in set(cluster)
+        ]
 
 
 # Files of other programs
 
 
 def foreign(path: Path, frames: int = 2, **changes) -> Path:
-    """A file as another program writes it: single precision, and a cell tilted by more than a half."""
+    """A file as another program writes it: single precision, and a cell tilted by more than a
+    half.
+    """
     rng = np.random.default_rng(0)
     with gsd.hoomd.open(path, "w") as file:
         for k in range(frames):
@@ -319,16 +347,22 @@ def assert_refused(path, words: str) -> None:
 
 
 @pytest.mark.parametrize(("words", "changes"), LACKING.items(), ids=LACKING)
-def test_a_file_that_lacks_something_is_refused_in_one_sentence(words: str, changes: dict, tmp_path: Path) -> None:
+def test_a_file_that_lacks_something_is_refused_in_one_sentence(
+    words: str, changes: dict, tmp_path: Path
+) -> None:
     assert_refused(foreign(tmp_path / "lacks.gsd", **changes), words)
 
 
-def test_a_torn_file_and_one_of_another_schema_are_refused_in_one_sentence(recorded, tmp_path: Path) -> None:
+def test_a_torn_file_and_one_of_another_schema_are_refused_in_one_sentence(
+    recorded, tmp_path: Path
+) -> None:
     content = recorded[0].read_bytes()
     for torn in (b"", b"no trajectory " * 99, content[:-300], content[:256]):
         (tmp_path / "torn.gsd").write_bytes(torn)
         assert_refused(tmp_path / "torn.gsd", "is not a readable GSD file")
-    with gsd.fl.open(str(tmp_path / "other.gsd"), "w", application="x", schema="rods", schema_version=[1, 0]):
+    with gsd.fl.open(
+        str(tmp_path / "other.gsd"), "w", application="x", schema="rods", schema_version=[1, 0]
+    ):
         pass
     assert_refused(tmp_path / "other.gsd", "its schema must be hoomd")
 
@@ -336,7 +370,9 @@ def test_a_torn_file_and_one_of_another_schema_are_refused_in_one_sentence(recor
 # Interruptions
 
 
-def test_an_old_file_stays_until_the_first_frame_is_there(seen, tmp_path: Path, monkeypatch) -> None:
+def test_an_old_file_stays_until_the_first_frame_is_there(
+    seen, tmp_path: Path, monkeypatch
+) -> None:
     path = tmp_path / "flow.gsd"
     path.write_bytes(b"old")
     with monkeypatch.context() as patch:
@@ -349,7 +385,9 @@ def test_an_old_file_stays_until_the_first_frame_is_there(seen, tmp_path: Path, 
     assert len(read_trajectory(path).step) == 1
 
 
-def test_a_file_of_another_format_is_refused_in_a_sentence(seen, tmp_path: Path, monkeypatch) -> None:
+def test_a_file_of_another_format_is_refused_in_a_sentence(
+    seen, tmp_path: Path, monkeypatch
+) -> None:
     path = tmp_path / "flow.gsd"
     with monkeypatch.context() as patch:
         patch.setattr(trajectory, "FORMAT_VERSION", 7)
@@ -361,7 +399,9 @@ def interrupts(*_, **__):
     raise KeyboardInterrupt
 
 
-def test_what_is_interrupted_within_a_frame_holds_the_frames_before(seen, tmp_path: Path, monkeypatch) -> None:
+def test_what_is_interrupted_within_a_frame_holds_the_frames_before(
+    seen, tmp_path: Path, monkeypatch
+) -> None:
     path = tmp_path / "flow.gsd"
     write_frame(path, seen[0.3], 0)
     write_frame(path, seen[0.0], 1)

@@ -1,4 +1,6 @@
-"""Every public name is transformed by JAX, or says in one sentence that it is not and what is; nothing runs here."""
+"""Every public name is transformed by JAX, or says in one sentence that it is not and what is;
+nothing runs here.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,8 +35,12 @@ def seen() -> jg.Snapshot:
 # Functions of one number, and of a state that is closed over.
 TRANSFORMED: dict[str, Callable[[Any, State], Any]] = {
     "advance": lambda x, state: jg.advance(replace(FLOW, restitution=x), state, STEPS),
-    "sample": lambda x, state: jg.sample(replace(FLOW, restitution=x), state, 0.1, blocks=2)[1].averages,
-    "snapshot_series": lambda x, state: jg.snapshot_series(replace(FLOW, restitution=x), state, 0.1, 2),
+    "sample": lambda x, state: (
+        jg.sample(replace(FLOW, restitution=x), state, 0.1, blocks=2)[1].averages
+    ),
+    "snapshot_series": lambda x, state: jg.snapshot_series(
+        replace(FLOW, restitution=x), state, 0.1, 2
+    ),
     "count_events": lambda x, state: jg.count_events(replace(FLOW, restitution=x), state, STEPS),
     "pack": lambda x, state: jg.pack(replace(FLOW, packing_fraction=x), KEY, state.grains),
     "polydisperse": lambda x, _: jg.polydisperse(COUNT, x / 2, KEY),
@@ -48,15 +54,20 @@ TRANSFORMED: dict[str, Callable[[Any, State], Any]] = {
     "constitutive_law": lambda x, _: jg.constitutive_law()(x, 0.7, 2 * x),
 }
 NOT_BACKWARD = {"advance", "sample", "snapshot_series", "count_events", "pack"}
-# Those take long to trace with their tangents; the derivatives of an advance are in the tests of the gradients.
+# Those take long to trace with their tangents; the derivatives of an advance are in the tests of
+# the gradients.
 LONG = {"count_events", "pack", "advance", "sample", "snapshot_series"}
 
 REFUSED: dict[str, Callable[[Any, State], Any]] = {
     "prepare": lambda x, _: jg.prepare(replace(FLOW, restitution=x), KEY),
     "heated": lambda x, _: jg.heated(FLOW, KEY, grains=jg.own_grains(x * jnp.ones(COUNT))),
-    "fit_trajectory": lambda x, state: jg.fit_trajectory(replace(FLOW, restitution=x), state, state, 9, 1e-3, 1e-3),
+    "fit_trajectory": lambda x, state: jg.fit_trajectory(
+        replace(FLOW, restitution=x), state, state, 9, 1e-3, 1e-3
+    ),
     "flow_figure": lambda x, _: jg.flow_figure(replace(seen(), restitution=x)),
-    "Sample": lambda x, state: jg.sample(replace(FLOW, restitution=x), state, 0.1, blocks=2)[1].errors(),
+    "Sample": lambda x, state: jg.sample(replace(FLOW, restitution=x), state, 0.1, blocks=2)[
+        1
+    ].errors(),
     "ratio_map": lambda x, _: jg.ratio_map([x], [0.6]),
 }
 
@@ -94,7 +105,9 @@ def test_jit_vmap_and_lax_map_apply(name: str, state: State) -> None:
 
 @pytest.mark.parametrize("name", sorted(TRANSFORMED.keys() - LONG))
 def test_derivatives_in_forward_mode_apply(name: str, state: State) -> None:
-    values, changes = jax.eval_shape(lambda x: jax.jvp(lambda y: TRANSFORMED[name](y, state), (x,), (1.0,)), X)
+    values, changes = jax.eval_shape(
+        lambda x: jax.jvp(lambda y: TRANSFORMED[name](y, state), (x,), (1.0,)), X
+    )
     assert jax.tree.map(lambda x: x.shape, values) == jax.tree.map(lambda x: x.shape, changes)
 
 
@@ -120,5 +133,7 @@ def test_what_computes_in_python_says_so(name: str, transformed: Callable, state
 
 
 def test_prepare_within_jit_says_so_whatever_it_is_given() -> None:
-    with pytest.raises(InputError, match=r"^prepare cannot be transformed by jax.jit.*: call it before"):
+    with pytest.raises(
+        InputError, match=r"^prepare cannot be transformed by jax.jit.*: call it before"
+    ):
         jax.jit(lambda: jg.prepare(FLOW, KEY))()

@@ -1,4 +1,6 @@
-"""What the reference table says of a flow: surfaces against algebra, series against the theory, verdicts, intervals."""
+"""What the reference table says of a flow: surfaces against algebra, series against the theory,
+verdicts, intervals.
+"""
 
 import json
 import subprocess
@@ -33,7 +35,9 @@ def result() -> dict:
 def a_surface(points: int = 12) -> Surface:
     rng = np.random.default_rng(0)
     where = rng.uniform(-1, 1, (points, 2))
-    return Surface(where, np.sin(2 * where[:, 0]) + where[:, 1], np.full(points, 0.05), Shape(0.7, (1.2, 0.9)))
+    return Surface(
+        where, np.sin(2 * where[:, 0]) + where[:, 1], np.full(points, 0.05), Shape(0.7, (1.2, 0.9))
+    )
 
 
 def test_a_surface_is_the_conditional_mean_of_a_gaussian_distribution() -> None:
@@ -52,7 +56,9 @@ def test_errors_of_points_left_out_are_those_of_surfaces_without_them() -> None:
     errors, expected = surface.left_out()
     for k in range(12):
         others = np.arange(12) != k
-        without = Surface(surface.points[others], surface.values[others], surface.stderrs[others], surface.shape)
+        without = Surface(
+            surface.points[others], surface.values[others], surface.stderrs[others], surface.shape
+        )
         value, stderr = without(surface.points[k])
         assert errors[k] == pytest.approx(surface.values[k] - value, rel=1e-6)
         assert expected[k] == pytest.approx(np.hypot(stderr, 0.05), rel=1e-6)
@@ -62,7 +68,9 @@ def test_errors_of_points_left_out_are_those_of_surfaces_without_them() -> None:
 @given(ALPHAS, NUS)
 def test_the_series_is_the_theory(alpha: float, nu: float) -> None:
     name = shipped_table().head["theory"]
-    theory = getattr(gaussian_moments if name == "gaussian_moments" else navier_stokes, name)(alpha, nu)
+    theory = getattr(gaussian_moments if name == "gaussian_moments" else navier_stokes, name)(
+        alpha, nu
+    )
     said = jg.validity(alpha, nu).theory
     for key in ("pressure", "shear_stress", "granular_temperature"):
         assert said[key] == pytest.approx(float(getattr(theory, key)), rel=1e-5)
@@ -76,7 +84,10 @@ def test_error_is_theory_over_measured_and_intervals_are_positive(alpha: float, 
         theory = found.theory[name.removeprefix("local_")]
         assert 1 + error == pytest.approx(theory / found.measured[name])
     assert found.theory["dissipation_rate"] == found.theory["shear_stress"]
-    assert all(np.all(x > 0) for x in jax.tree.leaves((found.measured_ci95, found.error_ci95, found.factors_ci95)))
+    assert all(
+        np.all(x > 0)
+        for x in jax.tree.leaves((found.measured_ci95, found.error_ci95, found.factors_ci95))
+    )
 
 
 def test_the_table_is_met_at_its_points_within_their_intervals() -> None:
@@ -89,7 +100,9 @@ def test_the_table_is_met_at_its_points_within_their_intervals() -> None:
         assert np.mean(apart < own) > 0.95
 
 
-VARIANCE_ROUNDING = 1e-4  # of a half-width: eps × 500 × √294 points over 1e-8 is 2e-4 of the variance at most
+VARIANCE_ROUNDING = (
+    1e-4  # of a half-width: eps × 500 × √294 points over 1e-8 is 2e-4 of the variance at most
+)
 
 
 def test_arrays_broadcast_and_jit_vmap_give_the_same_numbers() -> None:
@@ -97,16 +110,19 @@ def test_arrays_broadcast_and_jit_vmap_give_the_same_numbers() -> None:
     found = jg.validity(alphas, nus)
     assert found.measured["pressure"].shape == found.verdict().shape == (2, 3)
     compiled = jax.jit(jg.validity)(alphas, nus)
-    mapped = jax.vmap(lambda nu: jax.vmap(lambda alpha: jg.validity(alpha, nu))(jnp.asarray(alphas)))(
-        jnp.asarray(nus[:, 0])
-    )
+    mapped = jax.vmap(
+        lambda nu: jax.vmap(lambda alpha: jg.validity(alpha, nu))(jnp.asarray(alphas))
+    )(jnp.asarray(nus[:, 0]))
     for one in (compiled, mapped):
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(one), strict=True):
-            # a variance is the difference of two numbers of order 500, and those of factors are of order 1e-8
+            # a variance is the difference of two numbers of order 500, and those of factors are of
+            # order 1e-8
             np.testing.assert_allclose(np.broadcast_to(a, (2, 3)), b, rtol=VARIANCE_ROUNDING)
 
 
-@pytest.mark.parametrize("name", ["pressure", "shear_stress", "local_granular_temperature", "force_ratio"])
+@pytest.mark.parametrize(
+    "name", ["pressure", "shear_stress", "local_granular_temperature", "force_ratio"]
+)
 def test_gradients_are_those_of_finite_differences(name: str) -> None:
     def of(x):
         return jg.validity(x[0], x[1]).measured[name]
@@ -114,18 +130,24 @@ def test_gradients_are_those_of_finite_differences(name: str) -> None:
     at, step = jnp.array([0.45, 0.71]), 1e-4
     exact = jax.grad(of)(at)
     by_steps = [(of(at + step * one) - of(at - step * one)) / (2 * step) for one in np.eye(2)]
-    np.testing.assert_allclose(exact, by_steps, rtol=1e-5)  # truncation of step² over the range of the map squared
+    np.testing.assert_allclose(
+        exact, by_steps, rtol=1e-5
+    )  # truncation of step² over the range of the map squared
 
 
 def test_outside_the_range_is_refused_or_nan_where_jax_traces_it() -> None:
-    with pytest.raises(jg.InputError, match=r"packing_fraction must be between 0.1 and 0.83, the range"):
+    with pytest.raises(
+        jg.InputError, match=r"packing_fraction must be between 0.1 and 0.83, the range"
+    ):
         jg.validity(0.5, [0.5, 0.84])
     for wrong in ("a", None, np.nan, []):
         with pytest.raises(jg.InputError, match="restitution must be between"):
             jg.validity(wrong, 0.5)
     values = jax.jit(jg.validity)(jnp.array([0.04, 0.5]), 0.5).measured["pressure"]
     assert list(np.isnan(values)) == [True, False]
-    slopes = jax.grad(lambda x: jnp.nansum(jg.validity(x, 0.5).measured["pressure"]))(jnp.array([0.04, 0.5]))
+    slopes = jax.grad(lambda x: jnp.nansum(jg.validity(x, 0.5).measured["pressure"]))(
+        jnp.array([0.04, 0.5])
+    )
     assert np.all(np.isfinite(slopes))
 
 
@@ -135,34 +157,54 @@ def test_single_precision_is_refused_where_jax_traces() -> None:
 
 
 def made(error: float, ci95: float, ratio: float = 1.0, **factors: float) -> Validity:
-    all_factors = dict.fromkeys(FACTORS, np.array(1.0)) | {name: np.array(x) for name, x in factors.items()}
+    all_factors = dict.fromkeys(FACTORS, np.array(1.0)) | {
+        name: np.array(x) for name, x in factors.items()
+    }
     measured = {"force_ratio": np.array(ratio)}, {"force_ratio": np.array(0.001)}
     errors = {"pressure": np.array(error)}, {"pressure": np.array(ci95)}
-    return Validity(np.array(0.5), np.array(0.5), *measured, {}, *errors, {}, {}, {}, all_factors, {})
+    return Validity(
+        np.array(0.5), np.array(0.5), *measured, {}, *errors, {}, {}, {}, all_factors, {}
+    )
 
 
 @pytest.mark.parametrize(
     ("found", "said"),
     [
-        (made(-0.05, 0.02, chaos=0.8), ("underestimates the pressure by 5.0 ± 2.0 %", "correlated", "binary to 0.1 %")),
+        (
+            made(-0.05, 0.02, chaos=0.8),
+            ("underestimates the pressure by 5.0 ± 2.0 %", "correlated", "binary to 0.1 %"),
+        ),
         (made(0.2, 0.02, pairs=0.7), ("overestimates the pressure by 20.0 ± 2.0 %", "fewer pairs")),
         (
             made(0.01, 0.02, anisotropy=1.1, pairs=1.05),
-            ("agrees with the measured pressure", "departure from Enskog's assumptions: velocities are anisotropic"),
+            (
+                "agrees with the measured pressure",
+                "departure from Enskog's assumptions: velocities are anisotropic",
+            ),
         ),
         (made(0.01, 0.02), ("agrees with the measured pressure", "no assumption")),
-        (made(-0.9, 0.02, 4.0, binary=8.0, pairs=5.0), ("in clusters", "explain 25 % of the mean contact force")),
+        (
+            made(-0.9, 0.02, 4.0, binary=8.0, pairs=5.0),
+            ("in clusters", "explain 25 % of the mean contact force"),
+        ),
     ],
 )
-def test_a_verdict_says_error_cause_and_share_of_binary_collisions(found: Validity, said: tuple[str, ...]) -> None:
+def test_a_verdict_says_error_cause_and_share_of_binary_collisions(
+    found: Validity, said: tuple[str, ...]
+) -> None:
     assert all(words in found.verdict() for words in said)
 
 
 def test_the_command_prints_the_numbers_of_python_without_loading_jax(tmp_path: Path) -> None:
     command = "import sys; from jaxgran.cli.app import app; "
-    command += "app('where --restitution 0.7 --packing-fraction 0.6 --json'.split(), standalone_mode=False); "
+    command += (
+        "app('where --restitution 0.7 --packing-fraction 0.6 --json'.split(), "
+        "standalone_mode=False); "
+    )
     command += "assert 'jax' not in sys.modules and 'scipy' not in sys.modules"
-    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, cwd=tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-c", command], capture_output=True, text=True, cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     printed, found = json.loads(done.stdout), jg.validity(0.7, 0.6)
     assert printed["verdict"]["value"] == found.verdict()
@@ -180,7 +222,9 @@ def test_the_command_says_the_verdict_and_every_average(tmp_path: Path) -> None:
 
 
 def test_intervals_hold_on_fresh_flows_as_often_as_they_say(result: dict) -> None:
-    """The committed coverage is that of the table in this package, and 95 % is within binomial error of it."""
+    """The committed coverage is that of the table in this package, and 95 % is within binomial
+    error of it.
+    """
     fresh = json.loads((RESULTS / "reference_runs.json").read_text(encoding="utf-8"))["rows"]
     found = reference.coverage(list(reference.judged(shipped_table(), fresh)))
     for name, one in result["coverage"].items():

@@ -1,4 +1,6 @@
-"""States, flows, samples and snapshots are values: compared, indexed and counted, and their averages are attributes."""
+"""States, flows, samples and snapshots are values: compared, indexed and counted, and their
+averages are attributes.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -17,9 +19,18 @@ from jaxgran.sampling.sample import BLOCKS, Sample
 
 TIMES = 4
 FLOWS = jg.ShearFlow(16, [0.5, 0.9], 0.6, 1e-3)
-SERIES = snapshot_of(np.random.default_rng(0).uniform(0, 40, (TIMES, 5, 2)), [[(0, 1, 0.1)], [], [], [(2, 3, 0.2)]])
-SAMPLES = Sample(random_tally(np.random.default_rng(1), 2, BLOCKS), np.full(2, 81.0), np.ones(2), 16)
-VALUES = {"ShearFlow": FLOWS, "State": SERIES.state, "Grains": SERIES.state.grains, "Snapshot": SERIES}
+SERIES = snapshot_of(
+    np.random.default_rng(0).uniform(0, 40, (TIMES, 5, 2)), [[(0, 1, 0.1)], [], [], [(2, 3, 0.2)]]
+)
+SAMPLES = Sample(
+    random_tally(np.random.default_rng(1), 2, BLOCKS), np.full(2, 81.0), np.ones(2), 16
+)
+VALUES = {
+    "ShearFlow": FLOWS,
+    "State": SERIES.state,
+    "Grains": SERIES.state.grains,
+    "Snapshot": SERIES,
+}
 VALUES |= {"Sample": SAMPLES, "Tally": SAMPLES.tally}
 INDEXED = ("ShearFlow", "State", "Snapshot", "Sample")
 
@@ -42,7 +53,9 @@ def test_nan_equals_nan_and_the_number_of_grains_counts() -> None:
 
 
 def test_equal_flows_have_equal_hashes_however_they_name_the_rule() -> None:
-    named, numbered = (jg.ShearFlow(16, 0.5, 0.6, 1e-3, activation=rule) for rule in ("midpoint", 0.5))
+    named, numbered = (
+        jg.ShearFlow(16, 0.5, 0.6, 1e-3, activation=rule) for rule in ("midpoint", 0.5)
+    )
     assert named == numbered and len({named, numbered}) == 1
     with pytest.raises(TypeError, match="unhashable"):
         hash(FLOWS)
@@ -86,10 +99,16 @@ def test_dataset_of_a_sample_has_its_averages_errors_and_units(one: Sample) -> N
         np.testing.assert_array_equal(data[name], one.averages[name])
         np.testing.assert_array_equal(data[f"{name}_stderr"], errors[name])
         assert data[name].dims == (*axes, *row.axes)
-        assert data[name].attrs["long_name"] == row.meaning and data[name].attrs.get("reduced_unit", "1") == row.unit
+        assert (
+            data[name].attrs["long_name"] == row.meaning
+            and data[name].attrs.get("reduced_unit", "1") == row.unit
+        )
         assert ("standard deviation" in data[f"{name}_stderr"].long_name) == row.extreme
     np.testing.assert_array_equal(data.strain, one.strain)
-    assert data.status.flag_meanings.split()[int(np.max(data.status))] == Status(int(np.max(one.status))).name
+    assert (
+        data.status.flag_meanings.split()[int(np.max(data.status))]
+        == Status(int(np.max(one.status))).name
+    )
 
 
 def with_observed(observed: Any) -> Sample:
@@ -101,7 +120,9 @@ def test_dataset_of_a_sample_has_what_was_observed() -> None:
     sums = {"torque": rng.uniform(1, 2, (2, BLOCKS)), "fabric": rng.uniform(1, 2, (2, BLOCKS, 3))}
     samples = with_observed(sums)
     data = samples.to_dataset()
-    assert data.fabric.dims == ("replica", "fabric_dim_0") and samples[0].to_dataset().fabric.dims == ("fabric_dim_0",)
+    assert data.fabric.dims == ("replica", "fabric_dim_0") and samples[
+        0
+    ].to_dataset().fabric.dims == ("fabric_dim_0",)
     for name, x in sums.items():
         steps = SAMPLES.tally.steps.sum(axis=1).reshape(2, *[1] * (x.ndim - 2))
         np.testing.assert_allclose(data[name], x.sum(axis=1) / steps, rtol=1e-12)

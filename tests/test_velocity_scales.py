@@ -1,4 +1,6 @@
-"""Velocity scales: which part of the granular temperature is local, and which stands in the longest waves."""
+"""Velocity scales: which part of the granular temperature is local, and which stands in the longest
+waves.
+"""
 
 from dataclasses import replace
 
@@ -24,8 +26,12 @@ local_temperature, wave_temperature = map(
 def state_of(velocities, positions=None, tilt=0.3, masses=None) -> State:
     rng = np.random.default_rng(5)
     places = rng.uniform(0, SIDE, (COUNT, 2)) if positions is None else positions
-    grains = Grains(jnp.full(COUNT, 0.5), jnp.ones(COUNT) if masses is None else jnp.asarray(masses))
-    return State(grains, jnp.asarray(places), jnp.asarray(velocities), jnp.asarray(SIDE), jnp.asarray(tilt))
+    grains = Grains(
+        jnp.full(COUNT, 0.5), jnp.ones(COUNT) if masses is None else jnp.asarray(masses)
+    )
+    return State(
+        grains, jnp.asarray(places), jnp.asarray(velocities), jnp.asarray(SIDE), jnp.asarray(tilt)
+    )
 
 
 def places() -> np.ndarray:
@@ -73,9 +79,13 @@ def test_a_wave_of_the_sheared_cell_is_counted_if_it_is_one_of_the_longest(numbe
 def test_neither_depends_on_the_image_of_a_grain_or_on_the_cell_that_describes_the_lattice():
     rng = np.random.default_rng(3)
     velocities, one = rng.normal(size=(COUNT, 2)), places()
-    image = one + rng.integers(-2, 3, (COUNT, 1)) * np.array([SIDE, 0.0]) + np.array([0.3 * SIDE, SIDE])
+    image = (
+        one + rng.integers(-2, 3, (COUNT, 1)) * np.array([SIDE, 0.0]) + np.array([0.3 * SIDE, SIDE])
+    )
     for measure in (local_temperature, wave_temperature):
-        np.testing.assert_allclose(measure(state_of(velocities, image)), measure(state_of(velocities, one)), rtol=1e-9)
+        np.testing.assert_allclose(
+            measure(state_of(velocities, image)), measure(state_of(velocities, one)), rtol=1e-9
+        )
 
 
 def test_few_grains_are_one_box():
@@ -83,24 +93,32 @@ def test_few_grains_are_one_box():
     grains = Grains(jnp.full(16, 0.5), jnp.ones(16))
     positions = jnp.asarray(np.random.default_rng(4).uniform(0, 5, (16, 2)))
     state = State(grains, positions, jnp.asarray(velocities), jnp.asarray(5.0), jnp.asarray(0.0))
-    np.testing.assert_allclose(local_temperature(state), np.sum(np.var(velocities, axis=0)) / 2 * 16 / 15)
+    np.testing.assert_allclose(
+        local_temperature(state), np.sum(np.var(velocities, axis=0)) / 2 * 16 / 15
+    )
 
 
 def test_the_local_temperature_is_averaged_as_well_as_the_granular_temperature():
-    """In a dense dissipative flow, where both fluctuate alike; one reading a block had three times the error."""
+    """In a dense dissipative flow, where both fluctuate alike; one reading a block had three times
+    the error.
+    """
     flow = jg.ShearFlow(64, 0.2, 0.8, 1e-3)
     state = jg.prepare(flow, jax.random.key(0))
     _, sample = jg.sample(flow, state, 80.0)
     errors = sample.errors()
     local, granular = (
-        float(errors[name] / getattr(sample, name)) for name in ("local_granular_temperature", "granular_temperature")
+        float(errors[name] / getattr(sample, name))
+        for name in ("local_granular_temperature", "granular_temperature")
     )
     assert 0.5 < local / granular < 1.6
 
 
 def test_readings_of_both_engines_are_taken_in_the_same_steps(packed, engines):
     """Past one reading within the advance, in a dense and hardly sheared flow."""
-    rng, flow = np.random.default_rng(0), flow_of(0.7, restitution=1.0, timestep=2e-3, shear_rate=1e-3)
+    rng, flow = (
+        np.random.default_rng(0),
+        flow_of(0.7, restitution=1.0, timestep=2e-3, shear_rate=1e-3),
+    )
     state = replace(packed(0.7), velocities=jnp.asarray(rng.normal(size=(GRAINS, 2))))
     (_, numba), (end, plain) = (engines[name](flow, state, 1500) for name in ("numba", "jax"))
     assert numba.collisions == plain.collisions > READ_AFTER * GRAINS / 2

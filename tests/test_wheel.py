@@ -1,6 +1,7 @@
 """The wheel is installed elsewhere, and runs for a user who may write results and nothing else.
 
-If the tests run as root, the user is nobody. Otherwise it is the user of the tests, whose home is a file.
+If the tests run as root, the user is nobody. Otherwise it is the user of the tests, whose home is a
+file.
 """
 
 import os
@@ -22,7 +23,10 @@ from jaxgran.model.display import with_error
 pytestmark = [
     pytest.mark.environment,
     pytest.mark.skipif(os.name != "posix", reason="users are those of POSIX"),
-    pytest.mark.skipif(not (find_spec("hatchling") and find_spec("pip")), reason="hatchling or pip is not installed"),
+    pytest.mark.skipif(
+        not (find_spec("hatchling") and find_spec("pip")),
+        reason="hatchling or pip is not installed",
+    ),
 ]
 ROOT = Path(__file__).parents[1]
 PACKAGES = Path(np.__file__).parents[1]
@@ -32,14 +36,30 @@ SMALL = ("--restitution", "0.5,0.9", "--packing-fraction", "0.7", "--seeds", "1"
 
 @pytest.fixture(scope="module")
 def place() -> Iterator[Path]:
-    """A folder that every user can read, with the wheel installed in ``site``, which nobody can write."""
+    """A folder that every user can read, with the wheel installed in ``site``, which nobody can
+    write.
+    """
     folder = Path(tempfile.mkdtemp())
     folder.chmod(0o755)
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
-    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--no-compile"]
+    install = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+        "--no-compile",
+    ]
     wheels = map(str, folder.glob("*.whl"))
-    subprocess.run([*install, "--target", str(folder / "site"), *wheels], cwd=folder, check=True, capture_output=True)
+    subprocess.run(
+        [*install, "--target", str(folder / "site"), *wheels],
+        cwd=folder,
+        check=True,
+        capture_output=True,
+    )
     folders = [folder / "site", *(x for x in (folder / "site").rglob("*") if x.is_dir())]
     for one in folders:
         one.chmod(0o555)
@@ -51,16 +71,26 @@ def place() -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def anyone(place: Path) -> tuple[str, dict[str, Any], int]:
-    """Interpreter, arguments of a process and number of the user: nobody, if some interpreter lets root be so."""
+    """Interpreter, arguments of a process and number of the user: nobody, if some interpreter lets
+    root be so.
+    """
     if os.getuid() == 0:
         import pwd
 
         nobody = pwd.getpwnam("nobody")
         user = {"user": nobody.pw_uid, "group": nobody.pw_gid, "extra_groups": []}
         version = f"python{sys.version_info.major}.{sys.version_info.minor}"
-        for python in filter(None, (sys.executable, shutil.which(version, path="/usr/local/bin:/usr/bin"))):
+        for python in filter(
+            None, (sys.executable, shutil.which(version, path="/usr/local/bin:/usr/bin"))
+        ):
             try:
-                subprocess.run([python, "-c", "import numpy"], check=True, cwd=place, env=environment(place), **user)
+                subprocess.run(
+                    [python, "-c", "import numpy"],
+                    check=True,
+                    cwd=place,
+                    env=environment(place),
+                    **user,
+                )
                 return python, user, nobody.pw_uid
             except (PermissionError, subprocess.CalledProcessError):
                 continue  # it is in a folder of root
@@ -90,7 +120,9 @@ def test_a_user_without_rights_home_and_cache_gets_a_table(place: Path, anyone, 
     shared.mkdir()
     shared.chmod(0o777)
     variables = (
-        environment(place) | {"TMPDIR": str(folder)} | ({"XLA_FLAGS": os.environ["XLA_FLAGS"]} if further else {})
+        environment(place)
+        | {"TMPDIR": str(folder)}
+        | ({"XLA_FLAGS": os.environ["XLA_FLAGS"]} if further else {})
     )
     command = [python, "-m", "jaxgran", *FIRST_MAP, *further]
     done = subprocess.run(command, cwd=folder, env=variables, capture_output=True, **user)
@@ -105,5 +137,7 @@ def test_a_user_without_rights_home_and_cache_gets_a_table(place: Path, anyone, 
     there = data.sel(packing_fraction=0.7)
     for numbers in zip(there.force_ratio.values, there.force_ratio_stderr.values, strict=True):
         assert any(with_error(*numbers).replace("±", "+-") in row for row in rows)
-    assert {path.suffix for path in folder.iterdir()} >= {".nc", ".png"} and not list(shared.iterdir())
+    assert {path.suffix for path in folder.iterdir()} >= {".nc", ".png"} and not list(
+        shared.iterdir()
+    )
     assert (folder / "jaxgran_map.nc").stat().st_uid == number

@@ -1,14 +1,16 @@
 """Solutions of contact problems in extended precision, and certificates that anyone can check.
 
-The problem is 0 ≤ p ⟂ w = W p + u⁻ ≥ 0. What is certified are the numbers that stand in the file: normals, masses and
-u⁻ as the doubles that they are, and impulses as sums of two doubles. w of these is computed in fixed-point numbers of
-``BITS`` binary places, by integers of Python, so a certificate depends on no processor. Errors of it are below 10⁻⁹⁰.
+The problem is 0 ≤ p ⟂ w = W p + u⁻ ≥ 0. What is certified are the numbers that stand in the file:
+normals, masses and u⁻ as the doubles that they are, and impulses as sums of two doubles. w of these
+is computed in fixed-point numbers of ``BITS`` binary places, by integers of Python, so a
+certificate depends on no processor. Errors of it are below 10⁻⁹⁰.
 
-An approximate solution, of any origin, tells which contacts press: A = {W_cc p > w}. On these W_AA p = −u⁻_A is solved
-by iterative refinement (Wilkinson, Rounding Errors in Algebraic Processes, 1963): sparse factors in double precision
-give the corrections, and residuals in fixed point say what is left. A is read again after each. Where more contacts
-press than have independent normals, impulses are not unique, and rounding of the data decides which contacts carry
-them. Refinement then begins at the centre of all solutions and ends near the rounding of doubles; the certificate says
+An approximate solution, of any origin, tells which contacts press: A = {W_cc p > w}. On these W_AA
+p = −u⁻_A is solved by iterative refinement (Wilkinson, Rounding Errors in Algebraic Processes,
+1963): sparse factors in double precision give the corrections, and residuals in fixed point say
+what is left. A is read again after each. Where more contacts press than have independent normals,
+impulses are not unique, and rounding of the data decides which contacts carry them. Refinement then
+begins at the centre of all solutions and ends near the rounding of doubles; the certificate says
 so.
 """
 
@@ -22,7 +24,8 @@ from benchmarks.exact_contacts import balanced, interior_point
 
 BITS = 320  # binary places of a fixed-point number
 TARGET = 1e-30  # natural residual, relative to ‖min(u⁻, 0)‖, at which a refinement ends
-_SHIFT = 1e-12  # of the diagonal, which keeps a singular matrix regular; refinement takes its effect back
+# of the diagonal, which keeps a singular matrix regular; refinement takes its effect back
+_SHIFT = 1e-12
 _REFINEMENTS, _PATIENCE = 60, 8  # at most, and how many of them may gain nothing
 Fixed = np.ndarray  # of Python's integers, in units of 2^-BITS
 
@@ -47,7 +50,8 @@ class Problem(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """Impulses as the sum of two arrays of doubles, the velocities w after, and the certificate: see ``certificate``.
+    """Impulses as the sum of two arrays of doubles, the velocities w after, and the certificate:
+    see ``certificate``.
 
     Without a solution, ``impulses`` are the weights q of ``obstacle`` and ``velocities`` are empty.
     """
@@ -65,7 +69,8 @@ def incidence(problem: Problem) -> csc_array:
     rows, (nx, ny) = np.arange(count), problem.normals.T
     columns = np.concatenate([2 * i, 2 * i + 1, 2 * j, 2 * j + 1])
     return coo_array(
-        (np.concatenate([nx, ny, -nx, -ny]), (np.tile(rows, 4), columns)), shape=(count, 2 * len(problem.masses))
+        (np.concatenate([nx, ny, -nx, -ny]), (np.tile(rows, 4), columns)),
+        shape=(count, 2 * len(problem.masses)),
     ).tocsc()
 
 
@@ -92,7 +97,11 @@ def solved(problem: Problem, guess: np.ndarray) -> Solved:
         if pressing is None or np.any(pressing != (push > after)):
             pressing = push > after
             inner = matrix[pressing][:, pressing]
-            factor = splu((inner + _SHIFT * diags_array(inner.diagonal())).tocsc()) if np.any(pressing) else None
+            factor = (
+                splu((inner + _SHIFT * diags_array(inner.diagonal())).tocsc())
+                if np.any(pressing)
+                else None
+            )
         impulses = np.where(pressing, impulses, 0)
         if factor is not None:
             impulses[pressing] -= fixed(factor.solve(after[pressing]))
@@ -102,8 +111,12 @@ def solved(problem: Problem, guess: np.ndarray) -> Solved:
     return Solved(True, high, low, rounded(exact.after(total)), certificate(problem, high, low))
 
 
-def certificate(problem: Problem, impulses: np.ndarray, impulses_low: np.ndarray) -> dict[str, float]:
-    """How far impulses are from a solution, in fixed point; the names and units are those of ``ContactResiduals``."""
+def certificate(
+    problem: Problem, impulses: np.ndarray, impulses_low: np.ndarray
+) -> dict[str, float]:
+    """How far impulses are from a solution, in fixed point; the names and units are those of
+    ``ContactResiduals``.
+    """
     impulses_fixed = fixed(impulses) + fixed(impulses_low)
     after_fixed = _Exact(problem).after(impulses_fixed)
     own = delassus(problem).diagonal()
@@ -122,7 +135,9 @@ def certificate(problem: Problem, impulses: np.ndarray, impulses_low: np.ndarray
 
 
 class Centre(NamedTuple):
-    """Multipliers q of an interior-point method, see ``exact_contacts``: impulses are unit · q / left / lengths."""
+    """Multipliers q of an interior-point method, see ``exact_contacts``: impulses are unit · q /
+    left / lengths.
+    """
 
     rows: np.ndarray  # of G = H M^-½, of length one
     lengths: np.ndarray
@@ -131,7 +146,9 @@ class Centre(NamedTuple):
 
 
 def centre(problem: Problem) -> Centre:
-    """The solution in the middle of all, to some digits: where impulses are not unique, it leaves out no contact."""
+    """The solution in the middle of all, to some digits: where impulses are not unique, it leaves
+    out no contact.
+    """
     g = (incidence(problem) @ diags_array(np.repeat(problem.masses**-0.5, 2))).toarray()
     lengths = np.linalg.norm(g, axis=1)
     rows, rates = g / lengths[:, None], problem.approach / lengths
@@ -142,7 +159,9 @@ def centre(problem: Problem) -> Centre:
 
 
 def obstructed(problem: Problem) -> Solved | None:
-    """Weights q ≥ 0 with Hᵀ q = 0 and q·u⁻ < 0, refined: no velocities satisfy all contacts (Farkas). None without."""
+    """Weights q ≥ 0 with Hᵀ q = 0 and q·u⁻ < 0, refined: no velocities satisfy all contacts
+    (Farkas). None without.
+    """
     rows, lengths, multipliers, _ = centre(problem)
     weights = balanced(rows, multipliers) / lengths
     weights = weights / np.max(weights)
@@ -164,8 +183,9 @@ def obstructed(problem: Problem) -> Solved | None:
 def obstacle(problem: Problem, weights: np.ndarray, weights_low: np.ndarray) -> float:
     """‖M^-½ Hᵀ q‖ · x₁ / (−q·u⁻) in fixed point, infinite where q is no certificate.
 
-    Velocity changes x, in the norm of the kinetic energy, that satisfy all contacts have x ≥ −q·u⁻/‖M^-½ Hᵀ q‖. So they
-    are longer than 1/obstacle times x₁ = (Σ min(u⁻, 0)²/W_cc)^½, which stops the contacts one by one.
+    Velocity changes x, in the norm of the kinetic energy, that satisfy all contacts have x ≥
+    −q·u⁻/‖M^-½ Hᵀ q‖. So they are longer than 1/obstacle times x₁ = (Σ min(u⁻, 0)²/W_cc)^½, which
+    stops the contacts one by one.
     """
     q, exact = fixed(weights) + fixed(weights_low), _Exact(problem)
     gain = -float(rounded(np.array([np.sum((q * exact.approach) >> BITS)], object))[0])

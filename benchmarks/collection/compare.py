@@ -1,10 +1,12 @@
-"""Solvers side by side on the collection: each is a function, and all are judged by the same residual.
+"""Solvers side by side on the collection: each is a function, and all are judged by the same
+residual.
 
-A solver is a function ``prepare(entry, tolerance)`` that returns a function ``solve()``. What a program does once for
-a problem, such as building its matrices or compiling, belongs into ``prepare`` and is not timed. ``solve`` returns the
-impulses at restitution zero, (contacts,), or ``Answer(impulses, products)`` if it counts products with W or their
-equals, or None where it finds that there is no solution. It has a limit of its own, so that it ends. Whether it
-succeeded is not its own word: the residual of the natural map must be at most the tolerance. A ``ProjectedMethod``
+A solver is a function ``prepare(entry, tolerance)`` that returns a function ``solve()``. What a
+program does once for a problem, such as building its matrices or compiling, belongs into
+``prepare`` and is not timed. ``solve`` returns the impulses at restitution zero, (contacts,), or
+``Answer(impulses, products)`` if it counts products with W or their equals, or None where it finds
+that there is no solution. It has a limit of its own, so that it ends. Whether it succeeded is not
+its own word: the residual of the natural map must be at most the tolerance. A ``ProjectedMethod``
 stands for itself.
 """
 
@@ -29,7 +31,9 @@ from jaxgran.model.status import Status
 
 CAP = 20_000  # products with W of our own methods
 TIGHTEST = 1e-12  # tolerance that a projected method accepts
-_JUDGED = 1 + 1e-9  # of the tolerance: the residual is computed a second time, with another rounding
+_JUDGED = (
+    1 + 1e-9
+)  # of the tolerance: the residual is computed a second time, with another rounding
 
 
 class Answer(NamedTuple):
@@ -46,9 +50,9 @@ Prepare = Callable[[Entry, float], Solve]
 class Row(NamedTuple):
     """One solver on one problem.
 
-    ``residual`` is that of the natural map in float64, not a number where the solver returned no impulses.
-    ``products`` is not a number where it does not count them. ``solved`` says whether the answer is right: impulses
-    within the tolerance, or none for a problem that has no solution.
+    ``residual`` is that of the natural map in float64, not a number where the solver returned no
+    impulses. ``products`` is not a number where it does not count them. ``solved`` says whether the
+    answer is right: impulses within the tolerance, or none for a problem that has no solution.
     """
 
     solver: str
@@ -69,18 +73,35 @@ def compare(
     tolerance: float = 1e-6,
     timings: int = 3,
 ) -> list[Row]:
-    """Every solver on every problem, problem by problem, so that all meet the same load of the machine."""
-    return [_row(name, prepare, entry, tolerance, timings) for entry in entries for name, prepare in solvers.items()]
+    """Every solver on every problem, problem by problem, so that all meet the same load of the
+    machine.
+    """
+    return [
+        _row(name, prepare, entry, tolerance, timings)
+        for entry in entries
+        for name, prepare in solvers.items()
+    ]
 
 
-def _row(name: str, prepare: Prepare | jg.ProjectedMethod, entry: Entry, tolerance: float, timings: int) -> Row:
-    solve = (partial(projected, prepare) if isinstance(prepare, jg.ProjectedMethod) else prepare)(entry, tolerance)
+def _row(
+    name: str, prepare: Prepare | jg.ProjectedMethod, entry: Entry, tolerance: float, timings: int
+) -> Row:
+    solve = (partial(projected, prepare) if isinstance(prepare, jg.ProjectedMethod) else prepare)(
+        entry, tolerance
+    )
     solve()  # compiles
     seconds, answer = timed(solve, timings)
     impulses, products = answer if isinstance(answer, Answer) else (answer, np.nan)
     residual = np.nan if impulses is None else residual_of(entry, impulses)
     right = residual <= tolerance * _JUDGED if entry.solution.feasible else impulses is None
-    head = (name, entry.name, entry.family, entry.solution.feasible, len(entry.problem.approach), tolerance)
+    head = (
+        name,
+        entry.name,
+        entry.family,
+        entry.solution.feasible,
+        len(entry.problem.approach),
+        tolerance,
+    )
     return Row(*head, float(seconds), float(products), residual, bool(right))
 
 
@@ -93,7 +114,9 @@ def residual_of(entry: Entry, impulses: np.ndarray) -> float:
 
 
 def projected(method: jg.ProjectedMethod, entry: Entry, tolerance: float) -> Solve:
-    """A projected method, compiled for one of few shapes, with a tolerance and ``CAP`` in place of its own."""
+    """A projected method, compiled for one of few shapes, with a tolerance and ``CAP`` in place of
+    its own.
+    """
     network, count = padded(entry.problem), len(entry.problem.approach)
     method = replace(method, tolerance=max(tolerance, TIGHTEST), max_steps=CAP)
     call = partial(solved_network, network, method)

@@ -2,23 +2,28 @@
 
 The file is HDF5. Each problem is a group of the root, by its name; the order is that of the names.
 
-====================  =============  ===========  ============================================================
+====================  =============  ===========  ==================================================
 dataset               type           shape        meaning
-====================  =============  ===========  ============================================================
+====================  =============  ===========  ==================================================
 NAME/ends             int32          contacts, 2  numbers i and j of the two grains
 NAME/normals          float64        contacts, 2  unit vectors n from grain j to grain i
 NAME/masses           float64        grains       masses of the grains
 NAME/approach         float64        contacts     u⁻ = n·(v_i − v_j) before, negative if approaching
 NAME/impulses         float64        contacts     solution p at restitution zero; if feasible
-NAME/impulses_low     float64        contacts     what to add to it in extended precision; if feasible
-NAME/velocities       float64        contacts     w = u⁻ + W p after, at restitution zero; if feasible
-NAME/weights          float64        contacts     weights q that prove that there is none; if infeasible
-NAME/weights_low      float64        contacts     what to add to them in extended precision; if infeasible
-====================  =============  ===========  ============================================================
+NAME/impulses_low     float64        contacts     what to add to it in extended precision; if
+                                                  feasible
+NAME/velocities       float64        contacts     w = u⁻ + W p after, at restitution zero; if
+                                                  feasible
+NAME/weights          float64        contacts     weights q that prove that there is none; if
+                                                  infeasible
+NAME/weights_low      float64        contacts     what to add to them in extended precision; if
+                                                  infeasible
+====================  =============  ===========  ==================================================
 
-Attributes of a group are ``family``, ``origin`` (how it was made, in words), ``feasible`` (1 or 0), and the numbers of
-its certificate: ``natural_map``, ``complementarity``, ``energy``, ``approach`` and ``tension``, or ``obstacle``.
-Attributes of the file are ``format``, ``version``, ``law`` and ``units``.
+Attributes of a group are ``family``, ``origin`` (how it was made, in words), ``feasible`` (1 or 0),
+and the numbers of
+its certificate: ``natural_map``, ``complementarity``, ``energy``, ``approach`` and ``tension``, or
+  ``obstacle``. Attributes of the file are ``format``, ``version``, ``law`` and ``units``.
 """
 
 from collections.abc import Iterable
@@ -36,7 +41,8 @@ PATH = ROOT / "benchmarks" / "results" / "collection.h5"
 _HEAD = {
     "format": "jaxgran contact problems",
     "version": 1,
-    "law": "0 <= p, w >= 0, p.w = 0 with w = u + W p and W = H M^-1 H^T; with restitution a, impulses are (1 + a) p",
+    "law": "0 <= p, w >= 0, p.w = 0 with w = u + W p and W = H M^-1 H^T; with restitution a, "
+    "impulses are (1 + a) p",
     "units": "masses in that of a mean grain, velocities in mean diameters times the shear rate",
 }
 
@@ -44,15 +50,16 @@ _HEAD = {
 class Entry(NamedTuple):
     """A problem of the collection with its solution and what is known of it.
 
-    ==========  =======  ==================================================================================
+    ==========  =======  ===========================================================================
     field       type     meaning
-    ==========  =======  ==================================================================================
+    ==========  =======  ===========================================================================
     name        string   the name of its group
     family      string   what kind of network it is
     origin      string   how it was made
     problem     Problem  ends, normals, masses and approach; see ``certificates``
-    solution    Solved   impulses and velocities at restitution zero, or weights that prove that there are none
-    ==========  =======  ==================================================================================
+    solution    Solved   impulses and velocities at restitution zero, or weights that prove that
+                         there are none
+    ==========  =======  ===========================================================================
     """
 
     name: str
@@ -74,7 +81,10 @@ def write(path: Path, entries: Iterable[Entry]) -> None:
             file.attrs[key] = _plain(value)
         for entry in entries:
             group, solution = file.create_group(entry.name), entry.solution
-            group.attrs["family"], group.attrs["origin"] = _plain(entry.family), _plain(entry.origin)
+            group.attrs["family"], group.attrs["origin"] = (
+                _plain(entry.family),
+                _plain(entry.origin),
+            )
             group.attrs["feasible"] = np.int32(solution.feasible)
             for key, value in solution.certificate.items():
                 group.attrs[key] = value
@@ -87,7 +97,8 @@ def load(path: Path = PATH, most_contacts: int | None = None) -> list[Entry]:
     with h5py.File(path, "r") as file:
         if _text(file.attrs.get("format", b"")) != _HEAD["format"]:
             raise ValueError(
-                f"{path} is not a collection of contact problems: make one by python -m benchmarks collection."
+                f"{path} is not a collection of contact problems: make one by python -m benchmarks "
+                "collection."
             )
         if difference := other_version(str(path), file.attrs.get("version"), _HEAD["version"]):
             raise ValueError(difference)
@@ -109,7 +120,9 @@ def _entry(name: str, group: h5py.Group) -> Entry:
         group["velocities"][()] if feasible else np.zeros(0),
         {key: float(value) for key, value in group.attrs.items() if key not in told},
     )
-    return Entry(name, _text(group.attrs["family"]), _text(group.attrs["origin"]), problem, solution)
+    return Entry(
+        name, _text(group.attrs["family"]), _text(group.attrs["origin"]), problem, solution
+    )
 
 
 def _unknowns(solution: Solved) -> dict[str, np.ndarray]:
@@ -123,7 +136,9 @@ def _unknowns(solution: Solved) -> dict[str, np.ndarray]:
 
 
 def _plain(value: str | int) -> np.bytes_ | np.int32:
-    """A string of fixed length, which any reader of HDF5 knows and which lies in the header of its group."""
+    """A string of fixed length, which any reader of HDF5 knows and which lies in the header of its
+    group.
+    """
     return np.bytes_(value.encode()) if isinstance(value, str) else np.int32(value)
 
 

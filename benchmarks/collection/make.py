@@ -1,10 +1,11 @@
-"""The collection of contact problems: about 200 from 2 to 3000 contacts, with solutions that are proved.
+"""The collection of contact problems: about 200 from 2 to 3000 contacts, with solutions that are
+proved.
 
-python -m benchmarks collection                  # benchmarks/results/collection.h5 and a table of what is in it
-python -m benchmarks collection --quick          # few problems of each kind
+python -m benchmarks collection                  # benchmarks/results/collection.h5 and a table of
+what is in it python -m benchmarks collection --quick          # few problems of each kind
 
-The same seeds give the same bytes on one machine. ``files`` has the layout, ``certificates`` says how the solutions
-are computed and proved. Nothing here is timed.
+The same seeds give the same bytes on one machine. ``files`` has the layout, ``certificates`` says
+how the solutions are computed and proved. Nothing here is timed.
 """
 
 import hashlib
@@ -23,7 +24,10 @@ from benchmarks.output import Output
 from jaxgran.contact.delassus import spectral_bound
 from jaxgran.contact.problem import as_contacts
 
-UNIQUE, WORST = 1e-20, 1e-13  # natural residuals: above the first a solution is not unique, the last is refused
+UNIQUE, WORST = (
+    1e-20,
+    1e-13,
+)  # natural residuals: above the first a solution is not unique, the last is refused
 _GUESS = jg.BarzilaiBorwein(tolerance=1e-10, max_steps=500_000)
 
 
@@ -62,15 +66,22 @@ def proved(problem: Problem) -> Solved:
     result = obstructed(problem) if guess.status == jg.Status.infeasible else None
     if result is None:
         result = solved(problem, np.asarray(guess.impulses)[:count])
-        if result.certificate["natural_map"] > UNIQUE and (middle := centre(problem).impulses) is not None:
-            result = min(result, solved(problem, middle), key=lambda one: one.certificate["natural_map"])
+        if (
+            result.certificate["natural_map"] > UNIQUE
+            and (middle := centre(problem).impulses) is not None
+        ):
+            result = min(
+                result, solved(problem, middle), key=lambda one: one.certificate["natural_map"]
+            )
         if not result.certificate["natural_map"] <= WORST:
             raise ArithmeticError(f"no certificate for {count} contacts: {result.certificate}")
     return result
 
 
 _guess = jax.jit(jg.solve_contacts)
-_bound_of_grains = jax.jit(lambda network: spectral_bound(as_contacts(network), network.masses.size))
+_bound_of_grains = jax.jit(
+    lambda network: spectral_bound(as_contacts(network), network.masses.size)
+)
 
 
 def padded(problem: Problem) -> jg.ContactNetwork:
@@ -101,13 +112,17 @@ def summary(entries: list[Entry]) -> list[dict]:
         row |= {"fewest_contacts": min(sizes), "most_contacts": max(sizes)}
         for key in members[0].solution.certificate:
             values = [one.solution.certificate[key] for one in members]
-            row[f"{key}_median"], row[f"{key}_worst"] = (float(f"{f(values):.2g}") for f in (np.median, max))
+            row[f"{key}_median"], row[f"{key}_worst"] = (
+                float(f"{f(values):.2g}") for f in (np.median, max)
+            )
         rows.append(row)
     return rows
 
 
 def bounds(entries: list[Entry]) -> dict[str, float]:
-    """The diagonal bound of W from its entries over that from the grains: median and largest mean of a problem."""
+    """The diagonal bound of W from its entries over that from the grains: median and largest mean
+    of a problem.
+    """
     ratios = []
     for entry in entries:
         network, matrix = padded(entry.problem), entry.matrix
@@ -124,5 +139,8 @@ def table(rows: list[dict]) -> str:
     for row in rows:
         key = "natural_map" if row["feasible"] else "obstacle"
         sizes = f"{row['fewest_contacts']}–{row['most_contacts']}"
-        lines.append(f"{row['family']:20s} {row['problems']:8d}  {sizes:11s}  {key} {row[f'{key}_worst']:.1e}")
+        lines.append(
+            f"{row['family']:20s} {row['problems']:8d}  {sizes:11s}  {key} "
+            f"{row[f'{key}_worst']:.1e}"
+        )
     return "\n".join(lines)

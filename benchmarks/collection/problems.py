@@ -1,8 +1,9 @@
-"""The problems of the collection, made from seeds: networks of ``benchmarks.networks``, larger ones, and real flows.
+"""The problems of the collection, made from seeds: networks of ``benchmarks.networks``, larger
+ones, and real flows.
 
-Constructed networks are the same on every machine up to the last bits of a square root. Instants of flows repeat bit
-for bit on one machine. Another processor may round differently, and a dense flow then takes another course: the
-instants differ, the statistics do not.
+Constructed networks are the same on every machine up to the last bits of a square root. Instants of
+flows repeat bit for bit on one machine. Another processor may round differently, and a dense flow
+then takes another course: the instants differ, the statistics do not.
 """
 
 from collections.abc import Iterator
@@ -60,15 +61,26 @@ def constructed(quick: bool) -> Iterator[Made]:
         yield _made("chain", f"chain of {discs} discs, the first one hit", networks.chain(discs))
     for seed in seeds:
         for big in (1,) if quick else (1, 2, 3):
-            yield _made("size ratio 10", f"{big} large discs, seed {seed}", networks.size_ratio(big, seed))
+            yield _made(
+                "size ratio 10", f"{big} large discs, seed {seed}", networks.size_ratio(big, seed)
+            )
     for seed in seeds:
         for side in (4,) if quick else (4, 8):
-            yield _made("mass ratio 10000", f"{side} x {side} discs, seed {seed}", networks.mass_ratio(side, seed))
+            yield _made(
+                "mass ratio 10000",
+                f"{side} x {side} discs, seed {seed}",
+                networks.mass_ratio(side, seed),
+            )
     for side in () if quick else (16, 32):
-        yield _made("mass ratio 10000", f"{side} x {side} discs, seed 0", networks.mass_ratio(side, 0))
+        yield _made(
+            "mass ratio 10000", f"{side} x {side} discs, seed 0", networks.mass_ratio(side, 0)
+        )
     for rings in (1, 2) if quick else (1, 2, 3, 4, 9, 18):
         for struck in (True, False):
-            words = f"hexagon of {rings} rings, {'struck at a corner' if struck else 'pressed from all sides'}"
+            words = (
+                f"hexagon of {rings} rings, "
+                f"{'struck at a corner' if struck else 'pressed from all sides'}"
+            )
             yield _made("hexagonal cluster", words, networks.hexagonal(rings, struck))
     for grains, number in ((64, 1),) if quick else ((256, 4), (1500, 1)):
         for seed in range(number):
@@ -77,20 +89,29 @@ def constructed(quick: bool) -> Iterator[Made]:
     for discs in (3, 10) if quick else (3, 10, 40, 1000):
         yield _made("jammed row", f"{discs} discs in a closed row", networks.jammed_row(discs))
     for side in (4,) if quick else (4, 8, 30):
-        yield _made("jammed lattice", f"{side} x {side} discs in a full cell", networks.jammed_lattice(side))
+        yield _made(
+            "jammed lattice", f"{side} x {side} discs in a full cell", networks.jammed_lattice(side)
+        )
 
 
 def met_in_flows(quick: bool) -> Iterator[Made]:
-    """The flow networks of ``benchmarks.networks``, one of which is denser than a user may ask for."""
+    """The flow networks of ``benchmarks.networks``, one of which is denser than a user may ask
+    for.
+    """
     grains, count = (64, 1) if quick else (256, 6)
     for nu, alpha in networks.FLOWS[:2] if quick else networks.FLOWS:
         for number, network in enumerate(networks.flow_networks(nu, alpha, grains, count)):
-            words = f"N = {grains}, restitution {alpha:g}, packing fraction {nu:g}, dt = 0.001, number {number}"
+            words = (
+                f"N = {grains}, restitution {alpha:g}, packing fraction {nu:g}, dt = 0.001, "
+                f"number {number}"
+            )
             yield _made("sheared", words, network)
 
 
 def instants(points: tuple, sizes: tuple) -> Iterator[Made]:
-    """Networks of steps that flows of this program solve: sheared at dt = 1e-3, then at the time step of the point."""
+    """Networks of steps that flows of this program solve: sheared at dt = 1e-3, then at the time
+    step of the point.
+    """
     for restitution, packing_fraction, timestep in points:
         for grains, count in sizes:
             flow = jg.ShearFlow(grains, restitution, packing_fraction, timestep)
@@ -103,7 +124,8 @@ def instants(points: tuple, sizes: tuple) -> Iterator[Made]:
                 while not _is_worth_keeping(contacts := _contacts(flow, state)):
                     state = _advanced(flow, state, jnp.int32(1))
                 words = (
-                    f"N = {grains}, restitution {restitution:g}, packing fraction {packing_fraction:g}, "
+                    f"N = {grains}, restitution {restitution:g}, packing fraction "
+                    f"{packing_fraction:g}, "
                     f"dt = {timestep:g}, number {number}"
                 )
                 yield Made("flow", words, compact(contacts, np.asarray(state.grains.masses)))
@@ -133,4 +155,6 @@ def compact(contacts: Contacts, masses: np.ndarray) -> Problem:
     ends = np.stack([np.asarray(contacts.i), np.asarray(contacts.j)], axis=1)[used]
     grains, ends = np.unique(ends, return_inverse=True)
     normals, approach = np.asarray(contacts.normals)[used], np.asarray(contacts.approach)[used]
-    return Problem(ends.reshape(-1, 2).astype(np.int32), normals, np.asarray(masses)[grains], approach)
+    return Problem(
+        ends.reshape(-1, 2).astype(np.int32), normals, np.asarray(masses)[grains], approach
+    )

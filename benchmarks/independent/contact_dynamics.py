@@ -1,24 +1,28 @@
-"""The rival: contact dynamics of frictionless discs in steady simple shear, as one classical loop compiled by numba.
+"""The rival: contact dynamics of frictionless discs in steady simple shear, as one classical loop
+compiled by numba.
 
-It solves the same time step as jaxgran and shares no code with it, so it serves twice: as the time to beat on one core
-and as an independent check of the physics. The loop visits every time step, it never jumps over free flight; everything
-else is made to be fast:
+It solves the same time step as jaxgran and shares no code with it, so it serves twice: as the time
+to beat on one core and as an independent check of the physics. The loop visits every time step, it
+never jumps over free flight; everything else is made to be fast:
 
-- *Two Verlet lists.* A cell list fills an outer list with a wide skin; an inner list with a narrow one is filtered from
-  it. The skins follow from the fastest grain and the time step. The inner list is valid while a running bound on the
-  relative travel, twice the largest peculiar speed plus the shear across a pair, stays below its skin; the outer one by
-  measured displacements in the coordinates that move with the cell, plus the strain times the largest centre distance.
-- *Frozen pairs.* Between impulses every laboratory velocity is constant, so the squared separation of a near pair is a
-  parabola in time. The step evaluates its three stored coefficients: no image, no gather, no square root, SIMD code.
-  An impulse refreshes only the pairs of the grains it moved.
-- *Small problems.* Steps in which no contact approaches cost nothing more. Isolated pairs have a closed form, the other
-  contacts are solved one connected cluster at a time by projected Gauss-Seidel sweeps with mild over-relaxation, and
-  clusters in which nothing approaches are left out.
-- *Kinetic stress for free.* Its sums are carried through flights and impulses, so no step visits all grains.
+- *Two Verlet lists.* A cell list fills an outer list with a wide skin; an inner list with a narrow
+  one is filtered from it. The skins follow from the fastest grain and the time step. The inner list
+  is valid while a running bound on the relative travel, twice the largest peculiar speed plus the
+  shear across a pair, stays below its skin; the outer one by measured displacements in the
+  coordinates that move with the cell, plus the strain times the largest centre distance.
+- *Frozen pairs.* Between impulses every laboratory velocity is constant, so the squared separation
+  of a near pair is a parabola in time. The step evaluates its three stored coefficients: no image,
+  no gather, no square root, SIMD code. An impulse refreshes only the pairs of the grains it moved.
+- *Small problems.* Steps in which no contact approaches cost nothing more. Isolated pairs have a
+  closed form, the other contacts are solved one connected cluster at a time by projected
+  Gauss-Seidel sweeps with mild over-relaxation, and clusters in which nothing approaches are left
+  out.
+- *Kinetic stress for free.* Its sums are carried through flights and impulses, so no step visits
+  all grains.
 
-Axes: positions and velocities are ``(grains, 2)``, radii and masses ``(grains,)``. Velocities are peculiar: the
-laboratory velocity is ``velocity + shear_rate * y`` along x. The periodic cell has the lattice vectors ``(side, 0)``
-and ``(tilt * side, side)``, tilt in [-1/2, 1/2).
+Axes: positions and velocities are ``(grains, 2)``, radii and masses ``(grains,)``. Velocities are
+  peculiar: the laboratory velocity is ``velocity + shear_rate * y`` along x. The periodic cell has
+  the lattice vectors ``(side, 0)`` and ``(tilt * side, side)``, tilt in [-1/2, 1/2).
 """
 
 from __future__ import annotations
@@ -30,8 +34,9 @@ import numpy as np
 from numba import njit
 
 MAX_SWEEPS = 10_000
-# Over-relaxation of the Gauss-Seidel sweeps, in small clusters and in those of more than SMALL contacts: measured best.
-# 1 is the plain method, which needs twice the sweeps and up to 1.6 times the time in the densest flows.
+# Over-relaxation of the Gauss-Seidel sweeps, in small clusters and in those of more than SMALL
+# contacts: measured best. 1 is the plain method, which needs twice the sweeps and up to 1.6 times
+# the time in the densest flows.
 RELAX_SMALL, RELAX_LARGE, SMALL = 1.2, 1.45, 32
 # The skins balance the work on the lists against rebuilding them; the optimum is flat.
 INNER_SKIN, OUTER_SKIN = 1.8, 3.0
@@ -39,12 +44,15 @@ BLOCK = 64  # near pairs tested together
 ROW = 8  # numbers a contact brings to the solver
 FAR = 1e300
 
-# Fused multiply-adds are the only liberty taken with the arithmetic: infinities and NaN keep their meaning.
+# Fused multiply-adds are the only liberty taken with the arithmetic: infinities and NaN keep their
+# meaning.
 compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
 
 
 class Tally(NamedTuple):
-    """Sums and averages over one run; stresses are (xx, xy, yy), averaged over cell area and all steps."""
+    """Sums and averages over one run; stresses are (xx, xy, yy), averaged over cell area and all
+    steps.
+    """
 
     steps: int
     impulse: float  # sum of p
@@ -108,9 +116,11 @@ class Tally(NamedTuple):
 
 @compiled
 def _outer_pairs(x, y, radii, side, tilt, skin, heads, links, first, second, shift_x, image):
-    """Pairs with a gap below the skin, the x shift and the row of the image; positions lie in the primary cell.
+    """Pairs with a gap below the skin, the x shift and the row of the image; positions lie in the
+    primary cell.
 
-    Returns the number found, which may exceed the room in the arrays: then only the count is meaningful.
+    Returns the number found, which may exceed the room in the arrays: then only the count is
+    meaningful.
     """
     grains = x.size
     room = first.size
@@ -203,11 +213,12 @@ def _root(parent, grain):
 def _gauss_seidel(first, second, rows, impulse, kick_x, kick_y, start, stop, target):
     """Impulses of one cluster by projected Gauss-Seidel: 0 <= p, w = W p + u >= 0, p w = 0.
 
-    A row holds, per contact: the normal times the reduced mass, the normal over either mass, the normal velocity times
-    the reduced mass, and one over the reduced mass. Without relaxation the update of a contact over its reduced mass is
-    its residual min(diag(W) p, w), so a sweep estimates the norm for nothing; the residual of a single state decides.
-    ``target`` is the square of the norm to reach. Indices are unsigned, which spares the test for negative ones.
-    Returns the sweeps done, negative at the cap.
+    A row holds, per contact: the normal times the reduced mass, the normal over either mass, the
+      normal velocity times the reduced mass, and one over the reduced mass. Without relaxation the
+      update of a contact over its reduced mass is its residual min(diag(W) p, w), so a sweep
+      estimates the norm for nothing; the residual of a single state decides. ``target`` is the
+      square of the norm to reach. Indices are unsigned, which spares the test for negative ones.
+      Returns the sweeps done, negative at the cap.
     """
     relax = RELAX_LARGE if stop - start > SMALL else RELAX_SMALL
     for sweep in range(MAX_SWEEPS):
@@ -253,7 +264,9 @@ def _gauss_seidel(first, second, rows, impulse, kick_x, kick_y, start, stop, tar
 
 @compiled
 def _pad(parabola, count):
-    """Fill the last block of the inner list with pairs that never meet; returns the number of blocks."""
+    """Fill the last block of the inner list with pairs that never meet; returns the number of
+    blocks.
+    """
     blocks = (count + BLOCK - 1) // BLOCK
     for p in range(count, blocks * BLOCK):
         parabola[p // BLOCK, 0, p % BLOCK] = FAR
@@ -279,15 +292,33 @@ def _refresh(p, first, second, shift_x, shift_y, touch, x, y, vx, vy, shear_rate
 
 
 @compiled
-def _run(x, y, vx, vy, radii, masses, side, tilt, shear_rate, restitution, dt, theta, tolerance, steps, room, sums):
+def _run(
+    x,
+    y,
+    vx,
+    vy,
+    radii,
+    masses,
+    side,
+    tilt,
+    shear_rate,
+    restitution,
+    dt,
+    theta,
+    tolerance,
+    steps,
+    room,
+    sums,
+):
     """The loop. Positions and LABORATORY velocities (unwrapped) are advanced in place.
 
-    Between two rebuilds of the inner list grain positions are referred to the time of the rebuild: r(t) = r + v t, so
-    that only grains that receive an impulse are touched, by r -= (change of v) t.
+    Between two rebuilds of the inner list grain positions are referred to the time of the rebuild:
+    r(t) = r + v t, so that only grains that receive an impulse are touched, by r -= (change of v)
+    t.
 
-    ``room`` bounds the outer pairs: when there are more, the loop stops early. (To grow the arrays in here would make
-    numba count their references in every step.) Returns the tilt, the steps done and the pairs found, -1 if the time
-    step is too long for the cell.
+    ``room`` bounds the outer pairs: when there are more, the loop stops early. (To grow the arrays
+      in here would make numba count their references in every step.) Returns the tilt, the steps
+      done and the pairs found, -1 if the time step is too long for the cell.
     """
     grains = x.size
     largest = 2.0 * radii.max()
@@ -348,9 +379,12 @@ def _run(x, y, vx, vy, radii, masses, side, tilt, shear_rate, restitution, dt, t
     done = steps
     for step in range(steps):
         t = k * dt
-        rate = 2.0 * fastest * (1.0 + abs(shear_rate) * t) + abs(shear_rate) * (largest + max(inner_skin, 0.0))
+        rate = 2.0 * fastest * (1.0 + abs(shear_rate) * t) + abs(shear_rate) * (
+            largest + max(inner_skin, 0.0)
+        )
         if not travel + rate * ahead <= inner_skin:
-            # Bring every grain to the present, measure speeds and the displacement since the outer rebuild.
+            # Bring every grain to the present, measure speeds and the displacement since the outer
+            # rebuild.
             outer_strain += shear_rate * t
             square = 0.0
             farthest = 0.0
@@ -375,19 +409,25 @@ def _run(x, y, vx, vy, radii, masses, side, tilt, shear_rate, restitution, dt, t
             travel = 0.0
             widest = max(0.5 * side - largest, 1e-3 * largest)
             rate = 2.0 * fastest + abs(shear_rate) * largest
-            inner_skin = min(max(INNER_SKIN * math.sqrt(rate * dt * largest), 2.0 * rate * dt), 0.5 * widest)
+            inner_skin = min(
+                max(INNER_SKIN * math.sqrt(rate * dt * largest), 2.0 * rate * dt), 0.5 * widest
+            )
             if not rate * ahead <= inner_skin:
                 done = step
                 outer = -1
                 break
-            used = 2.0 * math.sqrt(farthest) + abs(outer_strain) * (largest + inner_skin) + inner_skin
+            used = (
+                2.0 * math.sqrt(farthest) + abs(outer_strain) * (largest + inner_skin) + inner_skin
+            )
             sums[_INNER] += 1
             if not used <= outer_skin:
                 sums[_OUTER] += 1
                 tilt += outer_strain
                 tilt -= math.floor(tilt + 0.5)
                 outer_strain = 0.0
-                outer_skin = min(max(OUTER_SKIN * math.sqrt(inner_skin * largest), 2.0 * inner_skin), widest)
+                outer_skin = min(
+                    max(OUTER_SKIN * math.sqrt(inner_skin * largest), 2.0 * inner_skin), widest
+                )
                 for i in range(grains):
                     row = math.floor(y[i] / side)
                     y[i] -= row * side
@@ -594,8 +634,8 @@ def _run(x, y, vx, vy, radii, masses, side, tilt, shear_rate, restitution, dt, t
                         rows[ROW * d + 7] = inverse
                         impulse[d] = 0.0
 
-                # A cluster may leave half its own share of the permitted squared residual plus half a share by size:
-                # the sum is no more than the tolerance of the whole step allows.
+                # A cluster may leave half its own share of the permitted squared residual plus half
+                # a share by size: the sum is no more than the tolerance of the whole step allows.
                 for m in range(clusters):
                     begin = cluster_start[m]
                     end = cluster_start[m + 1]
@@ -665,7 +705,18 @@ def _run(x, y, vx, vy, radii, masses, side, tilt, shear_rate, restitution, dt, t
             if 4 * kicked > grains:
                 for p in range(pairs):
                     _refresh(
-                        p, inner_first, inner_second, inner_x, inner_y, inner_touch, x, y, vx, vy, shear_rate, parabola
+                        p,
+                        inner_first,
+                        inner_second,
+                        inner_x,
+                        inner_y,
+                        inner_touch,
+                        x,
+                        y,
+                        vx,
+                        vy,
+                        shear_rate,
+                        parabola,
                     )
             else:
                 for h in range(kicked):
@@ -686,7 +737,9 @@ def _run(x, y, vx, vy, radii, masses, side, tilt, shear_rate, restitution, dt, t
                             parabola,
                         )
                         link = chain[link]
-            rate = 2.0 * fastest * (1.0 + abs(shear_rate) * t) + abs(shear_rate) * (largest + inner_skin)
+            rate = 2.0 * fastest * (1.0 + abs(shear_rate) * t) + abs(shear_rate) * (
+                largest + inner_skin
+            )
 
         # Free flight: the laboratory velocity is constant, the peculiar one is sheared.
         flight = shear_rate * dt
@@ -726,14 +779,15 @@ def advance(
       radii, masses: (grains,)
       side, tilt:    cell side and strain offset of the images
       restitution:   0 to 1, one number for all pairs
-      activation:    theta: a pair is a contact when free flight over theta * timestep makes it overlap;
-                     1/2 midpoint, 0 touching
+      activation:    theta: a pair is a contact when free flight over theta * timestep makes it
+                     overlap; 1/2 midpoint, 0 touching
       tolerance:     of |min(diag(W) p, w)| / |min(u, 0)| in each step
 
     Returns:
       positions in the primary cell, peculiar velocities, tilt in [-1/2, 1/2), Tally
 
-    Raises ValueError where the cell is narrower than two of the largest grains or the time step is too long for it.
+    Raises ValueError where the cell is narrower than two of the largest grains or the time step is
+    too long for it.
     """
     x, y = np.array(positions, float).T.copy()
     vx, vy = np.array(velocities, float).T.copy()
@@ -748,11 +802,14 @@ def advance(
     left = steps = int(steps)
     room = 12 * radii.size + 64
     while left > 0:
-        tilt, done, pairs = _run(x, y, vx, vy, radii, masses, side, tilt, shear_rate, *law, left, room, sums)
+        tilt, done, pairs = _run(
+            x, y, vx, vy, radii, masses, side, tilt, shear_rate, *law, left, room, sums
+        )
         left -= done
         if pairs < 0:
             raise ValueError(
-                "grains cross the cell in one time step or their velocities are not finite: shorten the time step"
+                "grains cross the cell in one time step or their velocities are not finite: "
+                "shorten the time step"
             )
         room = max(room, pairs + pairs // 4)
     vx -= shear_rate * y

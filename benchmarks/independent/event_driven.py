@@ -1,15 +1,18 @@
-"""Event-driven simulation of hard discs in steady simple shear, with a duration of contact t_c (the TC model).
+"""Event-driven simulation of hard discs in steady simple shear, with a duration of contact t_c (the
+TC model).
 
-It has no time step. Between collisions every disc moves on a straight line in the laboratory, and every collision is
-carried out at its own instant. It shares no code with jaxgran, so it is a reference for it.
+It has no time step. Between collisions every disc moves on a straight line in the laboratory, and
+every collision is carried out at its own instant. It shares no code with jaxgran, so it is a
+reference for it.
 
-A collision has the restitution α, or one if either disc has collided within the time t_c before (S. Luding and
-S. McNamara, Granular Matter 1, 113, 1998). So collisions that follow closely lose no energy, and no inelastic collapse
-can last. At t_c = 0 these are inelastic hard discs.
+A collision has the restitution α, or one if either disc has collided within the time t_c before (S.
+Luding and S. McNamara, Granular Matter 1, 113, 1998). So collisions that follow closely lose no
+energy, and no inelastic collapse can last. At t_c = 0 these are inelastic hard discs.
 
-How it works: near pairs are found with a cell list. The list stands until discs may have approached by more than its
-skin. The next collisions of near pairs stand in a heap. A stamp of each disc changes when it collides, and events with
-an old stamp are dropped. The periodic cell is sheared (Lees and Edwards): the image row above moves with γ̇L.
+How it works: near pairs are found with a cell list. The list stands until discs may have approached
+  by more than its skin. The next collisions of near pairs stand in a heap. A stamp of each disc
+  changes when it collides, and events with an old stamp are dropped. The periodic cell is sheared
+  (Lees and Edwards): the image row above moves with γ̇L.
 
 Units are those of jaxgran: mean diameter σ, mass of a mean grain m, and 1/γ̇.
 """
@@ -22,7 +25,10 @@ from numba import njit
 
 import jaxgran as jg
 
-MOST_SKIN, NARROW_SKIN = 1.0, 0.2  # σ, added to the reach of a near pair, and the same times the packing fraction
+MOST_SKIN, NARROW_SKIN = (
+    1.0,
+    0.2,
+)  # σ, added to the reach of a near pair, and the same times the packing fraction
 HEADROOM = 1.5  # a list stands until a disc is faster than this, over the fastest when it was made
 LEAST_SPEED = 1e-3  # σ/t, of the fastest disc, so that the life of a list is finite
 MOST_COLLISIONS = 20_000_000  # of a block; more are taken for a collapse
@@ -77,7 +83,8 @@ class Law(NamedTuple):
 
 
 class _Near(NamedTuple):
-    """List of near pairs, each for both of its discs: those of disc i are at the places from starts[i] to starts[i+1].
+    """List of near pairs, each for both of its discs: those of disc i are at the places from
+    starts[i] to starts[i+1].
 
     ======  =================  ========================================================
     starts  (discs + 1,)       where the near discs of each begin
@@ -94,14 +101,18 @@ class _Near(NamedTuple):
 def discs_of(state: jg.State) -> Discs:
     """The discs of a state of jaxgran; none of them has collided before."""
     radii, masses, positions, velocities = (
-        np.array(x, float) for x in (state.grains.radii, state.grains.masses, state.positions, state.velocities)
+        np.array(x, float)
+        for x in (state.grains.radii, state.grains.masses, state.positions, state.velocities)
     )
     never = np.full(len(radii), -np.inf)
     return Discs(radii, masses, positions, velocities, never, float(state.side), float(state.tilt))
 
 
-def sheared(discs: Discs, law: Law, duration: float, blocks: int = 1) -> tuple[Discs, dict[str, np.ndarray]]:
-    """The discs after a time, and the sums over each of the blocks into which it is divided, arrays (blocks,).
+def sheared(
+    discs: Discs, law: Law, duration: float, blocks: int = 1
+) -> tuple[Discs, dict[str, np.ndarray]]:
+    """The discs after a time, and the sums over each of the blocks into which it is divided, arrays
+    (blocks,).
 
     Raises:
       ValueError: the cell is too small for its discs.
@@ -115,18 +126,26 @@ def sheared(discs: Discs, law: Law, duration: float, blocks: int = 1) -> tuple[D
         raise ValueError("the cell must be at least three reaches of a disc wide: take more discs.")
     sums = np.zeros((blocks, len(SUMS)))
     for row in sums:
-        discs = discs._replace(**{name: getattr(discs, name).copy() for name in ("positions", "velocities", "last")})
-        tilt = _advance(discs, Law(*map(float, law)), duration / blocks, skin, cells, MOST_COLLISIONS, row)
+        discs = discs._replace(
+            **{name: getattr(discs, name).copy() for name in ("positions", "velocities", "last")}
+        )
+        tilt = _advance(
+            discs, Law(*map(float, law)), duration / blocks, skin, cells, MOST_COLLISIONS, row
+        )
         if row[COLLISIONS] >= MOST_COLLISIONS:
-            raise RuntimeError("more collisions than can be carried out, as in an inelastic collapse.")
+            raise RuntimeError(
+                "more collisions than can be carried out, as in an inelastic collapse."
+            )
         discs = discs._replace(tilt=tilt)
     return discs, dict(zip(SUMS, sums.T, strict=True))
 
 
 def averages(sums: dict[str, np.ndarray], discs: Discs) -> dict[str, np.ndarray]:
-    """Temperature, total pressure and shear stress, collisions per disc and time, and shares of elastic collisions.
+    """Temperature, total pressure and shear stress, collisions per disc and time, and shares of
+    elastic collisions.
 
-    Sums have any leading axes. The shares are those of the number of collisions and of the contact pressure.
+    Sums have any leading axes. The shares are those of the number of collisions and of the contact
+    pressure.
     """
     volume, count = discs.side**2 * sums["duration"], len(discs.radii)
     contact, kinetic = (sums[f"{name}_xx"] + sums[f"{name}_yy"] for name in ("contact", "kinetic"))
@@ -142,7 +161,9 @@ def averages(sums: dict[str, np.ndarray], discs: Discs) -> dict[str, np.ndarray]
 
 @njit(cache=True)
 def _advance(discs, law, duration, skin, cells, most, sums):
-    """Advance positions, velocities and last collisions in place, from list to list; the tilt at the end."""
+    """Advance positions, velocities and last collisions in place, from list to list; the tilt at
+    the end.
+    """
     positions, velocities, rate = discs.positions, discs.velocities, law.shear_rate
     reach = 2 * np.max(discs.radii) + skin
     tilt, left = discs.tilt, duration
@@ -150,7 +171,8 @@ def _advance(discs, law, duration, skin, cells, most, sums):
         tilt -= np.floor(tilt + 0.5)
         near = _near_pairs(positions, discs.radii, discs.side, tilt, rate, skin, cells)
         limit = HEADROOM * max(LEAST_SPEED, np.sqrt(np.max(np.sum(velocities**2, axis=1))))
-        # Two discs approach by life · (2 limit (1 + γ̇ life) + γ̇ reach) at most, less than the skin as γ̇ life < ½
+        # Two discs approach by life · (2 limit (1 + γ̇ life) + γ̇ reach) at most, less than the
+        # skin as γ̇ life < ½
         life = min(left, skin / (3 * limit + rate * reach))
         velocities[:, 0] += rate * positions[:, 1]
         lived = _collide(discs, law, near, life, limit, most, sums)
@@ -187,9 +209,15 @@ def _near_pairs(positions, radii, side, tilt, rate, skin, cells):
         for cell in range(9):
             j = first[(columns[i] + cell % 3 - 1) % cells, (rows[i] + cell // 3 - 1) % cells]
             while j >= 0:
-                right, up = np.round(shares[i, 0] - shares[j, 0]), np.round(shares[i, 1] - shares[j, 1])
+                right, up = (
+                    np.round(shares[i, 0] - shares[j, 0]),
+                    np.round(shares[i, 1] - shares[j, 1]),
+                )
                 dx, dy = side * (right + tilt * up), side * up
-                x, y = positions[i, 0] - positions[j, 0] - dx, positions[i, 1] - positions[j, 1] - dy
+                x, y = (
+                    positions[i, 0] - positions[j, 0] - dx,
+                    positions[i, 1] - positions[j, 1] - dy,
+                )
                 if i != j and x * x + y * y < (radii[i] + radii[j] + skin) ** 2:
                     near.append(j)
                     shifts.append((dx, dy, rate * dy))
@@ -202,7 +230,8 @@ def _near_pairs(positions, radii, side, tilt, rate, skin, cells):
 def _collide(discs, law, near, life, limit, most, sums):
     """All collisions during the life of a list, and the time that it has lived.
 
-    A disc is at position + velocity · time, with velocities of the laboratory. Both change when it collides.
+    A disc is at position + velocity · time, with velocities of the laboratory. Both change when it
+    collides.
     """
     masses, origins, velocities, last = discs.masses, discs.positions, discs.velocities, discs.last
     tc, rate = law.contact_duration, law.shear_rate
@@ -228,14 +257,18 @@ def _collide(discs, law, near, life, limit, most, sums):
         sums[CONTACT] += impulse * nx * sx
         sums[CONTACT + 1] += impulse * nx * sy
         sums[CONTACT + 2] += impulse * ny * sy
-        sums[DISSIPATION] += (1 - one_plus_alpha * one_plus_alpha) / 2 * reduced * approach * approach
+        sums[DISSIPATION] += (
+            (1 - one_plus_alpha * one_plus_alpha) / 2 * reduced * approach * approach
+        )
         sums[COLLISIONS] += 1
         if soft:
             sums[ELASTIC] += 1
             sums[ELASTIC_TRACE] += impulse * distance
         too_fast = False
         for disc, push in ((i, impulse), (j, -impulse)):
-            _add_kinetic(sums, masses[disc], origins[disc], velocities[disc], since[disc], now, rate)
+            _add_kinetic(
+                sums, masses[disc], origins[disc], velocities[disc], since[disc], now, rate
+            )
             for axis, change in ((0, push * nx / masses[disc]), (1, push * ny / masses[disc])):
                 origins[disc, axis] -= change * now
                 velocities[disc, axis] += change
@@ -255,7 +288,9 @@ def _collide(discs, law, near, life, limit, most, sums):
 
 @njit(cache=True)
 def _predict(heap, discs, near, stamps, i, now, life):
-    """Puts the collisions of a disc with its near ones into the heap, those that come in the life of the list."""
+    """Puts the collisions of a disc with its near ones into the heap, those that come in the life
+    of the list.
+    """
     for place in range(near.starts[i], near.starts[i + 1]):
         j = near.discs[place]
         sx, sy, ux, uy = _relative(discs.positions, discs.velocities, near, i, place, now)
@@ -272,7 +307,10 @@ def _predict(heap, discs, near, stamps, i, now, life):
 def _relative(origins, velocities, near, i, place, now):
     """Separation and relative velocity of a disc and the image of a near one."""
     j = near.discs[place]
-    ux, uy = velocities[i, 0] - velocities[j, 0] - near.shifts[place, 2], velocities[i, 1] - velocities[j, 1]
+    ux, uy = (
+        velocities[i, 0] - velocities[j, 0] - near.shifts[place, 2],
+        velocities[i, 1] - velocities[j, 1],
+    )
     sx = origins[i, 0] - origins[j, 0] - near.shifts[place, 0] + ux * now
     sy = origins[i, 1] - origins[j, 1] - near.shifts[place, 1] + uy * now
     return sx, sy, ux, uy

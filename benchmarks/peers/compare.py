@@ -1,13 +1,17 @@
-"""Peers on the same flows: seconds of one core for a unit of strain against the errors of pressure and shear stress.
+"""Peers on the same flows: seconds of one core for a unit of strain against the errors of pressure
+and shear stress.
 
-jaxgran, the numba loop and LAMMPS (see the modules beside this one) shear the same discs from the same steady state.
-Contact dynamics runs at several time steps, soft discs at several stiffnesses, whose time step is a fixed share of a
-contact: both trade time for accuracy. Each has its own process, all share one core and take turns, round after round.
-Times are medians of the CPU time over the rounds; wall-clock times stand beside them. What a first call takes longer
-(compilation) is reported apart. Errors are relative to a reference, contact dynamics at a time step of 3e-5 and a
-tolerance of 1e-6 over a longer strain.
+jaxgran, the numba loop and LAMMPS (see the modules beside this one) shear the same discs from the
+same steady state. Contact dynamics runs at several time steps, soft discs at several stiffnesses,
+whose time step is a fixed share of a
+contact: both trade time for accuracy. Each has its own process, all share one core and take turns,
+  round after round. Times are medians of the CPU time over the rounds; wall-clock times stand
+  beside them. What a first call takes longer (compilation) is reported apart. Errors are relative
+  to a reference, contact dynamics at a time step of 3e-5 and a tolerance of 1e-6 over a longer
+  strain.
 
-The time to an error of 3 % is read off the front of error against time, in logarithms (see ``front.py``).
+The time to an error of 3 % is read off the front of error against time, in logarithms (see
+``front.py``).
 
     python -m benchmarks peers           # about 20 minutes
     python -m benchmarks peers --quick   # one flow of 256 discs, under 3 minutes
@@ -48,7 +52,11 @@ class Plan(NamedTuple):
     most_seconds: float  # for a unit of strain, beyond which a setting is left out
 
 
-CASES = Case(Flow(0.8, 0.6), 4, 12, 150), Case(Flow(0.5, 0.7), 4, 12, 150), Case(Flow(0.5, 0.8), 2, 16, 60)
+CASES = (
+    Case(Flow(0.8, 0.6), 4, 12, 150),
+    Case(Flow(0.5, 0.7), 4, 12, 150),
+    Case(Flow(0.5, 0.8), 2, 16, 60),
+)
 FULL = Plan(CASES, 1000, 2.8)
 QUICK = Plan((Case(Flow(0.8, 0.6), 2, 4, 40),), 256, 1)
 
@@ -66,7 +74,10 @@ def run(output: Output) -> None:
     for case in plan.cases:
         begin, load = time.perf_counter(), os.getloadavg()
         flows.append(compare_peers(plan, case, peers))
-        flows[-1] |= {"load_averages": [load, os.getloadavg()], "wall_seconds": time.perf_counter() - begin}
+        flows[-1] |= {
+            "load_averages": [load, os.getloadavg()],
+            "wall_seconds": time.perf_counter() - begin,
+        }
         report(flows[-1])
     print(table(flows))
     result = {
@@ -86,12 +97,16 @@ def compare_peers(plan: Plan, case: Case, peers: list) -> dict:
     law = jg.ShearFlow(plan.discs, flow.restitution, flow.packing_fraction, 1e-3)
     discs = jaxgran_itself.discs_of(jg.prepare(law, jax.random.key(0)))
     workers = [Worker(peer.__name__.rpartition(".")[2]) for peer in peers]
-    right, seconds = reference(workers[peers.index(numba_rival)] if numba_rival in peers else workers[0], discs, case)
+    right, seconds = reference(
+        workers[peers.index(numba_rival)] if numba_rival in peers else workers[0], discs, case
+    )
     runs, rows = {}, []
     for peer, worker in zip(peers, workers, strict=True):
         for curve, settings in peer.CURVES.items():
             for setting in settings:
-                rows.append(first_looks(worker, len(rows), discs, case, curve, setting, plan.most_seconds))
+                rows.append(
+                    first_looks(worker, len(rows), discs, case, curve, setting, plan.most_seconds)
+                )
                 if "failure" not in rows[-1]:
                     runs[len(rows) - 1] = worker
     stresses, clocks, depths = ({k: [] for k in runs} for _ in range(3))
@@ -116,7 +131,11 @@ def compare_peers(plan: Plan, case: Case, peers: list) -> dict:
         run.close(k)
     for worker in workers:
         worker.shutdown()
-    plan_of_flow = {"strain": case.strain, "rounds": case.rounds, "reference_rounds": case.reference_rounds}
+    plan_of_flow = {
+        "strain": case.strain,
+        "rounds": case.rounds,
+        "reference_rounds": case.reference_rounds,
+    }
     return {
         **flow._asdict(),
         **plan_of_flow,
@@ -126,7 +145,9 @@ def compare_peers(plan: Plan, case: Case, peers: list) -> dict:
     }
 
 
-def reference(worker: Worker, discs: Discs, case: Case) -> tuple[dict[str, tuple[float, float]], float]:
+def reference(
+    worker: Worker, discs: Discs, case: Case
+) -> tuple[dict[str, tuple[float, float]], float]:
     """The right averages with their errors, and the seconds that a unit of strain of them took."""
     worker.begin(-1, discs, case.flow, "reference", REFERENCE_TIMESTEP, case.strain)
     worker.advance(-1)
@@ -136,12 +157,18 @@ def reference(worker: Worker, discs: Discs, case: Case) -> tuple[dict[str, tuple
 
 
 def first_looks(
-    worker: Worker, key: int, discs: Discs, case: Case, curve: str, setting: float, most_seconds: float
+    worker: Worker,
+    key: int,
+    discs: Discs,
+    case: Case,
+    curve: str,
+    setting: float,
+    most_seconds: float,
 ) -> dict:
     """The row of a setting so far, and its run begun, past a round that is left out.
 
-    The first call is that of a short run apart, so that it shows compilation. Where a program fails, or would take
-    longer than the plan allows, the row says so.
+    The first call is that of a short run apart, so that it shows compilation. Where a program
+    fails, or would take longer than the plan allows, the row says so.
     """
     row = {"peer": worker.peer, "curve": curve, "setting": setting}
     try:
@@ -160,9 +187,13 @@ def first_looks(
 
 def averages(stresses: Sequence[Stress]) -> dict[str, tuple[float, float]]:
     """Means over the rounds and their standard errors."""
-    rounds = {name: np.array([[getattr(stress, name) for stress in stresses]]) for name in OBSERVABLES}
+    rounds = {
+        name: np.array([[getattr(stress, name) for stress in stresses]]) for name in OBSERVABLES
+    }
     rounds["count"] = np.ones((1, len(stresses)))
-    value, error = jackknife(lambda sums: {name: sums[name] / sums["count"] for name in OBSERVABLES}, rounds)
+    value, error = jackknife(
+        lambda sums: {name: sums[name] / sums["count"] for name in OBSERVABLES}, rounds
+    )
     return {name: (float(value[name]), float(error[name])) for name in OBSERVABLES}
 
 
@@ -173,16 +204,25 @@ def relative(value: tuple[float, float], right: tuple[float, float]) -> tuple[fl
 
 def report(flow: dict) -> None:
     """Print the rows of a flow."""
-    words = ", ".join(f"{name} {value:.4g} ± {error:.2g}" for name, (value, error) in flow["reference"].items())
+    words = ", ".join(
+        f"{name} {value:.4g} ± {error:.2g}" for name, (value, error) in flow["reference"].items()
+    )
     print(f"α {flow['restitution']:g}, ν {flow['packing_fraction']:g}: {words}")
     print(
-        "curve                       setting   cpu s   wall s   pressure          shear stress      overlap: mean, max"
+        "curve                       setting   cpu s   wall s   pressure          shear stress     "
+        " overlap: mean, max"
     )
     for row in flow["rows"]:
         head = f"{row['curve']:26s}{row['setting']:9.0e}"
         if "failure" in row:
             print(f"{head}  {row['failure']}")
             continue
-        cells = "".join("{:8.2f} ± {:4.2f} % ".format(*(100 * x for x in row["errors"][name])) for name in OBSERVABLES)
+        cells = "".join(
+            "{:8.2f} ± {:4.2f} % ".format(*(100 * x for x in row["errors"][name]))
+            for name in OBSERVABLES
+        )
         times = f"{row['cpu_seconds_per_strain']:8.4f}{row['wall_seconds_per_strain']:9.4f}"
-        print(f"{head}{times}  {cells}   {row['mean_overlap']:.1e} {row['largest_overlap']:.1e}", flush=True)
+        print(
+            f"{head}{times}  {cells}   {row['mean_overlap']:.1e} {row['largest_overlap']:.1e}",
+            flush=True,
+        )

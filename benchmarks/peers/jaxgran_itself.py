@@ -1,4 +1,6 @@
-"""jaxgran as a peer of the others: several time steps, at the default tolerance and a coarse one, midpoint rule."""
+"""jaxgran as a peer of the others: several time steps, at the default tolerance and a coarse one,
+midpoint rule.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -28,12 +30,18 @@ def begin(discs: Discs, flow: Flow, curve: str, timestep: float, duration: float
     )
     solver, strain = jg.BarzilaiBorwein(TOLERANCES[curve]), duration * flow.shear_rate
     grains = Grains(jnp.asarray(discs.radii), jnp.asarray(discs.masses))
-    arrays = (np.asarray(x, float) for x in (discs.positions, discs.velocities, discs.side, discs.tilt))
-    state = jg.State(grains, *map(jnp.asarray, arrays))  # no weak types, or the second call would compile again
+    arrays = (
+        np.asarray(x, float) for x in (discs.positions, discs.velocities, discs.side, discs.tilt)
+    )
+    state = jg.State(
+        grains, *map(jnp.asarray, arrays)
+    )  # no weak types, or the second call would compile again
 
     def advance() -> Stress:
         nonlocal state
-        state, sample = jax.block_until_ready(jg.sample(law, state, strain, blocks=1, solver=solver))
+        state, sample = jax.block_until_ready(
+            jg.sample(law, state, strain, blocks=1, solver=solver)
+        )
         sample = jax.tree.map(np.asarray, sample)
         averages = sample.averages
         return Stress(float(averages["pressure"]), float(averages["shear_stress"]))

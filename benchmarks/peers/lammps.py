@@ -1,21 +1,24 @@
 """LAMMPS as a peer: soft frictionless discs in a sheared box, on one core.
 
-Discs repel as damped springs (``pair_style granular``, ``hooke`` with ``damping coeff_restitution``), which damps each
-pair so that its restitution is α whatever its masses. The box is sheared by ``fix deform`` with velocities remapped.
-Masses are set to d² (``sphere`` would take them from a density), and since no friction turns a disc and all stay at
-z = 0, the plainest integrator ``fix nve`` suffices. In two dimensions LAMMPS's pressure is a force per length; its
+Discs repel as damped springs (``pair_style granular``, ``hooke`` with ``damping
+coeff_restitution``), which damps each pair so that its restitution is α whatever its masses. The
+box is sheared by ``fix deform`` with velocities remapped. Masses are set to d² (``sphere`` would
+take them from a density), and since no friction turns a disc and all stay at z = 0, the plainest
+integrator ``fix nve`` suffices. In two dimensions LAMMPS's pressure is a force per length; its
 kinetic part takes the velocities less those of the box (``compute temp/deform``).
 
-Two of LAMMPS's defaults are replaced. Its test for rebuilding the neighbour list follows the laboratory motion, of
-discs and box corners, and so rebuilds about ten times too often in a sheared box: here the list is rebuilt after as
-many steps as no pair can cross its skin in, which gives the same trajectory, to rounding, in half the time in loose
-flows. And where ``fix deform`` flips a tilted box it wraps the discs that have just left it through the top or the
-bottom without changing their velocity by that of the image: a few discs are shot through the flow in every unit of
-strain. So it flips nothing here; runs end at a tilt of a half, and the box is exchanged for the less tilted one between
-them.
+Two of LAMMPS's defaults are replaced. Its test for rebuilding the neighbour list follows the
+laboratory motion, of discs and box corners, and so rebuilds about ten times too often in a sheared
+box: here the list is rebuilt after as many steps as no pair can cross its skin in, which gives the
+same trajectory, to rounding, in half the time in loose flows. And where ``fix deform`` flips a
+tilted box it wraps the discs that have just left it through the top or the bottom without changing
+their velocity by that of the image: a few discs are shot through the flow in every unit of strain.
+So it flips nothing here; runs end at a tilt of a half, and the box is exchanged for the less tilted
+one between them.
 
-With 20 steps in the shortest contact the restitution of one collision scatters by about 0.02 around an α of 0.5, as it
-depends on where a step falls in the contact, with 10 steps by 0.03; the means are off by less than 0.025.
+With 20 steps in the shortest contact the restitution of one collision scatters by about 0.02 around
+an α of 0.5, as it depends on where a step falls in the contact, with 10 steps by 0.03; the means
+are off by less than 0.025.
 """
 
 import ctypes
@@ -28,7 +31,10 @@ import numpy as np
 from benchmarks.peers.problem import Discs, Flow, Run, Stress, closing_speed, soft_timestep
 
 STIFFNESSES = (1e3, 1e4, 3e4, 1e5, 3e5, 1e6)
-CURVES = {"LAMMPS, 20 steps a contact": STIFFNESSES, "LAMMPS, 10 steps a contact": (*STIFFNESSES, 1e7, 1e8)}
+CURVES = {
+    "LAMMPS, 20 steps a contact": STIFFNESSES,
+    "LAMMPS, 10 steps a contact": (*STIFFNESSES, 1e7, 1e8),
+}
 STEPS_PER_CONTACT = dict(zip(CURVES, (20, 10), strict=True))
 SKINS = (0.1, 0.6)
 STEPS_OF_A_LIST = 20  # aimed at, within the bounds of the skin
@@ -113,7 +119,9 @@ def begin(
     steps = max(1, round(duration / timestep / sampling)) * sampling
     timestep = duration / steps
     if skin is None:
-        skin = float(np.clip(STEPS_OF_A_LIST * timestep * closing_speed(discs, flow.shear_rate), *SKINS))
+        skin = float(
+            np.clip(STEPS_OF_A_LIST * timestep * closing_speed(discs, flow.shear_rate), *SKINS)
+        )
     program = set_up(discs, flow, stiffness, skin, timestep)
     program.commands_list(
         [
@@ -124,7 +132,10 @@ def begin(
     )
 
     def advance() -> Stress:
-        mean = f"fix mean all ave/time {sampling} 1 {sampling} c_stress[1] c_stress[2] c_stress[4] ave running"
+        mean = (
+            f"fix mean all ave/time {sampling} 1 {sampling} c_stress[1] c_stress[2] c_stress[4] "
+            "ave running"
+        )
         program.command(mean)
         left = steps
         while left > 0:
@@ -146,7 +157,9 @@ def begin(
     def current() -> Discs:
         own = program.extract_setting("nlocal")  # images of the discs stand behind
         order = np.argsort(program.numpy.extract_atom("id")[:own])
-        x, v, radii, masses = (program.numpy.extract_atom(name)[order] for name in ("x", "v", "radius", "rmass"))
+        x, v, radii, masses = (
+            program.numpy.extract_atom(name)[order] for name in ("x", "v", "radius", "rmass")
+        )
         peculiar = v[:, :2] - flow.shear_rate * np.stack([x[:, 1], np.zeros(len(x))], axis=-1)
         return Discs(x[:, :2].copy(), peculiar, radii, masses, discs.side, _tilt(program))
 
@@ -159,7 +172,9 @@ def _tilt(program) -> float:
 
 
 def _flip(program, shear_rate: float) -> None:
-    """Exchange the box for the same lattice with its tilt less by one; discs above or below it come back before."""
+    """Exchange the box for the same lattice with its tilt less by one; discs above or below it come
+    back before.
+    """
     low, high, xy, *_ = program.extract_box()
     side, own = high[1] - low[1], program.extract_setting("nlocal")
     x, v = (program.numpy.extract_atom(name)[:own] for name in ("x", "v"))

@@ -1,7 +1,9 @@
-"""The loop of ``independent.contact_dynamics`` as a peer: same time step and law as jaxgran, no code in common.
+"""The loop of ``independent.contact_dynamics`` as a peer: same time step and law as jaxgran, no
+code in common.
 
-The loop looks at every time step, but only at the parabola of each near pair's separation, and refreshes the pairs of
-discs that were hit alone. It has no simpler way than that, and none that leaves steps out.
+The loop looks at every time step, but only at the parabola of each near pair's separation, and
+refreshes the pairs of discs that were hit alone. It has no simpler way than that, and none that
+leaves steps out.
 """
 
 from benchmarks.independent import contact_dynamics

@@ -1,8 +1,9 @@
-"""What all peers are given and what they return: a flow, discs at one instant, stresses, and the law of soft discs.
+"""What all peers are given and what they return: a flow, discs at one instant, stresses, and the
+law of soft discs.
 
-Units as in jaxgran: lengths in mean diameters, masses in that of a mean disc (m = d²), times in 1/shear rate.
-Velocities are peculiar, the laboratory's are ``velocity + shear_rate * y`` along x. The cell has the lattice vectors
-(side, 0) and (tilt · side, side).
+Units as in jaxgran: lengths in mean diameters, masses in that of a mean disc (m = d²), times in
+  1/shear rate. Velocities are peculiar, the laboratory's are ``velocity + shear_rate * y`` along x.
+  The cell has the lattice vectors (side, 0) and (tilt · side, side).
 """
 
 import math
@@ -21,7 +22,9 @@ class Flow(NamedTuple):
 
 
 class Discs(NamedTuple):
-    """Positions and peculiar velocities (discs, 2), radii and masses (discs,), side and tilt of the cell."""
+    """Positions and peculiar velocities (discs, 2), radii and masses (discs,), side and tilt of the
+    cell.
+    """
 
     positions: np.ndarray
     velocities: np.ndarray
@@ -45,34 +48,47 @@ class Run(NamedTuple):
 
 
 def overlaps(discs: Discs) -> tuple[float, float]:
-    """Mean overlap of the touching pairs, in mean diameters (zero if none touch), and the largest."""
+    """Mean overlap of the touching pairs, in mean diameters (zero if none touch), and the
+    largest.
+    """
     d = discs.positions[:, None] - discs.positions[None]
     rows = np.round(d[..., 1] / discs.side)
     dx = d[..., 0] - rows * discs.tilt * discs.side
     dx -= discs.side * np.round(dx / discs.side)
     distance = np.hypot(dx, d[..., 1] - rows * discs.side)
-    depth = (discs.radii[:, None] + discs.radii[None] - distance)[np.triu_indices(len(discs.radii), 1)]
+    depth = (discs.radii[:, None] + discs.radii[None] - distance)[
+        np.triu_indices(len(discs.radii), 1)
+    ]
     touching = depth[depth > 0]
     return (float(touching.mean()), float(touching.max())) if touching.size else (0.0, 0.0)
 
 
 def damping_ratio(restitution: float) -> float:
-    """ζ of the damped spring F = kδ − 2ζ√(km) u whose half period takes a velocity u to −αu, for any mass.
+    """ζ of the damped spring F = kδ − 2ζ√(km) u whose half period takes a velocity u to −αu, for
+    any mass.
 
-    A half period of m δ'' + 2ζ√(km) δ' + kδ = 0 multiplies the velocity by −exp(−πζ/√(1−ζ²)), so that
-    ζ = 1/√(1 + (π/ln α)²). The force is attractive just before the discs part.
+    A half period of m δ'' + 2ζ√(km) δ' + kδ = 0 multiplies the velocity by −exp(−πζ/√(1−ζ²)), so
+    that ζ = 1/√(1 + (π/ln α)²). The force is attractive just before the discs part.
     """
     return 0.0 if restitution == 1 else 1 / math.sqrt(1 + (math.pi / math.log(restitution)) ** 2)
 
 
-def soft_timestep(discs: Discs, restitution: float, stiffness: float, steps_per_contact: int) -> float:
-    """A share of the contact time π√(m/k)/√(1−ζ²) of two of the lightest discs, m their reduced mass."""
+def soft_timestep(
+    discs: Discs, restitution: float, stiffness: float, steps_per_contact: int
+) -> float:
+    """A share of the contact time π√(m/k)/√(1−ζ²) of two of the lightest discs, m their reduced
+    mass.
+    """
     reduced = discs.masses.min() / 2
-    contact_time = math.pi * math.sqrt(reduced / stiffness) / math.sqrt(1 - damping_ratio(restitution) ** 2)
+    contact_time = (
+        math.pi * math.sqrt(reduced / stiffness) / math.sqrt(1 - damping_ratio(restitution) ** 2)
+    )
     return contact_time / steps_per_contact
 
 
 def closing_speed(discs: Discs, shear_rate: float) -> float:
-    """A bound on the speed at which a gap closes: two of the fastest discs, and the shear across them."""
+    """A bound on the speed at which a gap closes: two of the fastest discs, and the shear across
+    them.
+    """
     fastest = SAFETY * np.sqrt(np.max(np.sum(discs.velocities**2, axis=-1)))
     return float(2 * fastest + 2 * shear_rate * discs.radii.max())

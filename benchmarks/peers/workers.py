@@ -23,7 +23,9 @@ class Worker:
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(1, context, initializer=_initialise, initargs=(peer,))
 
-    def begin(self, key: int, discs: Discs, flow: Flow, curve: str, setting: float, duration: float) -> None:
+    def begin(
+        self, key: int, discs: Discs, flow: Flow, curve: str, setting: float, duration: float
+    ) -> None:
         """Begin a run, which goes by the key from now on."""
         self._pool.submit(_begin, key, discs, flow, curve, setting, duration).result()
 

@@ -17,7 +17,9 @@ from benchmarks.collection.certificates import incidence
 
 
 class Program(NamedTuple):
-    """minimise ½ xᵀ P x + q·x subject to x ≥ 0, ``count`` unknowns; impulses are ``scale`` times the unknowns."""
+    """minimise ½ xᵀ P x + q·x subject to x ≥ 0, ``count`` unknowns; impulses are ``scale`` times
+    the unknowns.
+    """
 
     p: csc_matrix
     q: np.ndarray
@@ -46,4 +48,6 @@ def columns(matrix: sparray) -> csc_matrix:
     """Compressed columns in order, with indices of 32 bits, which is what the packages take."""
     made = matrix.tocsc()
     made.sort_indices()
-    return csc_matrix((made.data, made.indices.astype(np.int32), made.indptr.astype(np.int32)), shape=made.shape)
+    return csc_matrix(
+        (made.data, made.indices.astype(np.int32), made.indptr.astype(np.int32)), shape=made.shape
+    )

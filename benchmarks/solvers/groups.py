@@ -8,7 +8,11 @@ from benchmarks.solvers.measure import Row
 
 FLOWS = ("flow", "sheared")
 SMALL, MEDIUM = 30, 300  # contacts
-FLOW_GROUPS = (f"flows, up to {SMALL} contacts", f"flows, {SMALL + 1} to {MEDIUM}", f"flows, more than {MEDIUM}")
+FLOW_GROUPS = (
+    f"flows, up to {SMALL} contacts",
+    f"flows, {SMALL + 1} to {MEDIUM}",
+    f"flows, more than {MEDIUM}",
+)
 CONSTRUCTED = ("static packing", "chain", "size ratio 10", "mass ratio 10000", "hexagonal cluster")
 INFEASIBLE = "no solution"
 OUTCOMES = ("ok", "missed", "slow", "skipped")
@@ -43,7 +47,8 @@ def median(costs: Sequence[float]) -> float:
 
 
 def summary(rows: Sequence[Row]) -> list[dict]:
-    """Of each group, solver and target: how many are solved, on how many none is faster, and medians of the costs.
+    """Of each group, solver and target: how many are solved, on how many none is faster, and
+    medians of the costs.
 
     A median is null where the median solve fails. Errors are the worst of those that are solved.
     """
@@ -76,11 +81,17 @@ def _rounded(value: float) -> float | None:
 
 
 def table(rows: Sequence[Row], targets: Sequence[float] = (1e-4, 1e-8), shown: int = 3) -> str:
-    """Who is best where: the fastest solvers of each group, with median microseconds and what they solve of it."""
+    """Who is best where: the fastest solvers of each group, with median microseconds and what they
+    solve of it.
+    """
     members, lines = grouped(rows), []
     for group in GROUPS:
         for target in (0.0,) if group == INFEASIBLE else targets:
-            found = {key[1]: each for key, each in members.items() if key[0] == group and key[2] == target}
+            found = {
+                key[1]: each
+                for key, each in members.items()
+                if key[0] == group and key[2] == target
+            }
             if not found:
                 continue
             ranked = sorted(found, key=lambda name: median([cost(row) for row in found[name]]))
@@ -92,6 +103,9 @@ def table(rows: Sequence[Row], targets: Sequence[float] = (1e-4, 1e-8), shown: i
 
 def table_cell(name: str, members: Sequence[Row]) -> str:
     """A solver with its median time, and the share that it solves unless that is all."""
-    time, solved = median([cost(row) for row in members]), sum(row.outcome == "ok" for row in members)
+    time, solved = (
+        median([cost(row) for row in members]),
+        sum(row.outcome == "ok" for row in members),
+    )
     share = "" if solved == len(members) else f", {solved} of {len(members)}"
     return f"{name}: {1e6 * time:.3g} µs{share}" if np.isfinite(time) else f"{name}: –{share}"

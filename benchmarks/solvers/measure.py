@@ -1,11 +1,14 @@
-"""What a residual costs: each solver from a loose tolerance to a tight one, judged by the residual of this program.
+"""What a residual costs: each solver from a loose tolerance to a tight one, judged by the residual
+of this program.
 
-Tolerances of packages mean different things. So each solver is run with tolerances of its own, a power of ten after
-the other, until its residual ‖min(W_cc p, w)‖ / ‖min(u⁻, 0)‖ is below the smallest target. A target costs what the
-cheapest run does that meets it. A solve of more than ``LIMIT`` seconds is a failure. After it no tighter tolerance is
-tried, and no problem of that family whose time, growing as the square of the contacts, would be beyond the limit too.
+Tolerances of packages mean different things. So each solver is run with tolerances of its own, a
+power of ten after the other, until its residual ‖min(W_cc p, w)‖ / ‖min(u⁻, 0)‖ is below the
+smallest target. A target costs what the cheapest run does that meets it. A solve of more than
+``LIMIT`` seconds is a failure. After it no tighter tolerance is tried, and no problem of that
+family whose time, growing as the square of the contacts, would be beyond the limit too.
 
-Times are those of the processor, of this process on one core, so that other work on the machine counts little.
+Times are those of the processor, of this process on one core, so that other work on the machine
+counts little.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +23,10 @@ from benchmarks.timing import timed
 
 TARGETS = (1e-2, 1e-4, 1e-6, 1e-8)
 LIMIT = 1.0  # seconds
-_TIGHTEST, _LARGE = 16, 300  # power of the last tolerance; contacts from which only every second one is tried
+_TIGHTEST, _LARGE = (
+    16,
+    300,
+)  # power of the last tolerance; contacts from which only every second one is tried
 _MANY = 1000  # iterations, from which a run that repeats the one before has come to its limit
 
 
@@ -37,10 +43,11 @@ class Attempt(NamedTuple):
 class Row(NamedTuple):
     """The cheapest run of a solver on a problem that meets a target, or a failure.
 
-    ``outcome`` is ok, missed (the residual is not reached), slow (beyond the limit), or skipped (see the module). Costs
-    and errors of a failure are not a number, and so are iterations that a solver does not count. ``velocity_error`` is
-    max |w − w_exact| / max |min(u⁻, 0)|, and ``stress_error`` that of Σ p n⊗n. A problem without a solution has one
-    row, with the target 0: ok if the solver says so.
+    ``outcome`` is ok, missed (the residual is not reached), slow (beyond the limit), or skipped
+    (see the module). Costs and errors of a failure are not a number, and so are iterations that a
+    solver does not count. ``velocity_error`` is max |w − w_exact| / max |min(u⁻, 0)|, and
+    ``stress_error`` that of Σ p n⊗n. A problem without a solution has one row, with the target 0:
+    ok if the solver says so.
     """
 
     solver: str
@@ -58,7 +65,9 @@ class Row(NamedTuple):
 
 
 def run_solvers(
-    solvers: Mapping[str, Solver], entries: Sequence[Entry], note: Callable[[str, Entry, list[Attempt]], None]
+    solvers: Mapping[str, Solver],
+    entries: Sequence[Entry],
+    note: Callable[[str, Entry, list[Attempt]], None],
 ) -> list[Row]:
     """All solvers on all problems, problem by problem; ``note`` receives the runs of each."""
     rows, slowest = [], {}
@@ -117,17 +126,29 @@ def best_run(name: str, entry: Entry, matrix, runs: list[Attempt], target: float
         return _row(name, entry, target, "slow" if runs[-1].seconds > LIMIT else "missed")
     run = min(good, key=lambda one: one.seconds)
     errors = velocity_error(entry, matrix, run.impulses), stress_error(entry, run.impulses)
-    return _row(name, entry, target, "ok", run.tolerance, run.seconds, run.iterations, run.residual, *errors)
+    return _row(
+        name, entry, target, "ok", run.tolerance, run.seconds, run.iterations, run.residual, *errors
+    )
 
 
 def _row(name: str, entry: Entry, target: float, outcome: str, *costs: float) -> Row:
-    return Row(name, entry.name, entry.family, len(entry.problem.approach), target, outcome, *map(float, costs))
+    return Row(
+        name,
+        entry.name,
+        entry.family,
+        len(entry.problem.approach),
+        target,
+        outcome,
+        *map(float, costs),
+    )
 
 
 def velocity_error(entry: Entry, matrix, impulses: np.ndarray) -> float:
     """max |w − w_exact| / max |min(u⁻, 0)|."""
     approach = entry.problem.approach
-    return float(np.max(np.abs(matrix @ impulses + approach - entry.solution.velocities)) / -np.min(approach))
+    return float(
+        np.max(np.abs(matrix @ impulses + approach - entry.solution.velocities)) / -np.min(approach)
+    )
 
 
 def stress_error(entry: Entry, impulses: np.ndarray) -> float:

@@ -1,4 +1,6 @@
-"""The contact solve of the engine ``numba``, called alone: isolated pairs, then cluster by cluster."""
+"""The contact solve of the engine ``numba``, called alone: isolated pairs, then cluster by
+cluster.
+"""
 
 import math
 
@@ -28,7 +30,9 @@ from jaxgran.dynamics.numba_engine.network import find_clusters, solve_isolated
 
 
 def by_cluster(entry: Entry, tolerance: float) -> Solve:
-    """The impulses as a step of the engine computes them; counts the most iterations of a cluster."""
+    """The impulses as a step of the engine computes them; counts the most iterations of a
+    cluster.
+    """
     problem = entry.problem
     ends, count = np.ascontiguousarray(problem.ends.T, np.uint32), len(problem.masses)
     normals, inverse_masses = np.ascontiguousarray(problem.normals.T), 1 / problem.masses
@@ -70,7 +74,9 @@ def _solve(memory, ends, normals, inverse_masses, approach, impulses, tolerance,
         starts = clusters.starts
         for m in range(found):
             share = spare * (starts[m + 1] - starts[m]) / (starts[found] - starts[m])
-            needed, left, missed = solve_cluster(m, share, most_iterations, grains, network, clusters)
+            needed, left, missed = solve_cluster(
+                m, share, most_iterations, grains, network, clusters
+            )
             iterations, outcome = max(iterations, needed), max(outcome, missed)
             spare -= left if left < share else share
     for c in range(contacts):

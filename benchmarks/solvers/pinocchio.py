@@ -1,14 +1,16 @@
-"""The constraint solvers of Pinocchio: projected Gauss–Seidel, and the alternating direction method of multipliers.
+"""The constraint solvers of Pinocchio: projected Gauss–Seidel, and the alternating direction method
+of multipliers.
 
-Its contacts have three rows and Coulomb friction. Limits of joints are scalar unilateral constraints, whose set is the
-orthant p ≥ 0. So a model of one sliding joint for each contact, all at their lower limits, poses exactly this problem
-with any Delassus matrix. The model says nothing but the number of constraints, and is made once.
+Its contacts have three rows and Coulomb friction. Limits of joints are scalar unilateral
+constraints, whose set is the orthant p ≥ 0. So a model of one sliding joint for each contact, all
+at their lower limits, poses exactly this problem with any Delassus matrix. The model says nothing
+but the number of constraints, and is made once.
 
-Dense matrices are copied to the stack, which has to be larger than usual for more than a thousand contacts. There is no
-limit of time, so that of iterations is set by their measured time.
+Dense matrices are copied to the stack, which has to be larger than usual for more than a thousand
+contacts. There is no limit of time, so that of iterations is set by their measured time.
 
-Source of the second method: Carpentier, Le Lidec and Montaut, From Compliant to Rigid Contact Simulation: a Unified
-and Efficient Approach, Robotics: Science and Systems (2024).
+Source of the second method: Carpentier, Le Lidec and Montaut, From Compliant to Rigid Contact
+  Simulation: a Unified and Efficient Approach, Robotics: Science and Systems (2024).
 """
 
 import resource
@@ -35,7 +37,8 @@ def _widen_stack() -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_STACK)
     if soft != resource.RLIM_INFINITY and soft < _STACK:
         resource.setrlimit(
-            resource.RLIMIT_STACK, (_STACK if hard == resource.RLIM_INFINITY else min(_STACK, hard), hard)
+            resource.RLIMIT_STACK,
+            (_STACK if hard == resource.RLIM_INFINITY else min(_STACK, hard), hard),
         )
 
 
@@ -62,7 +65,11 @@ def gauss_seidel(entry: Entry, tolerance: float) -> Solve:
     """Projected Gauss–Seidel. It takes a dense matrix alone."""
     rates, scale = scaled(entry)
     chosen = _chosen(pin.PGSSolverSettings(), tolerance, PGS)
-    matrix, sets, solver = np.asfortranarray(entry.matrix.toarray()), orthant(len(rates)), pin.PGSConstraintSolver()
+    matrix, sets, solver = (
+        np.asfortranarray(entry.matrix.toarray()),
+        orthant(len(rates)),
+        pin.PGSConstraintSolver(),
+    )
 
     def solve() -> Answer:
         result = pin.PGSSolverResult()
@@ -73,7 +80,9 @@ def gauss_seidel(entry: Entry, tolerance: float) -> Solve:
 
 
 def multipliers(entry: Entry, tolerance: float) -> Solve:
-    """Alternating directions: each iteration solves with W + ρ, which is factored anew whenever ρ changes."""
+    """Alternating directions: each iteration solves with W + ρ, which is factored anew whenever ρ
+    changes.
+    """
     rates, scale = scaled(entry)
     chosen = _chosen(pin.ADMMSolverSettings(), tolerance, ADMM)
     matrix, sets, solver = columns(entry.matrix), orthant(len(rates)), pin.ADMMConstraintSolver()
@@ -96,7 +105,9 @@ def _limited(solve: Callable[[], Answer], settings: Any, contacts: int) -> Solve
             solve()
             seconds.append(time.process_time() - start)
         each = max(seconds[1] - seconds[0], 1e-9) / (_MORE - _FEW)
-        settings.max_iterations = int(min(MOST, max(_FEW, _FEW + 1.1 * (LIMIT - seconds[0]) / each)))
+        settings.max_iterations = int(
+            min(MOST, max(_FEW, _FEW + 1.1 * (LIMIT - seconds[0]) / each))
+        )
     return solve
 
 
@@ -106,5 +117,7 @@ def _chosen(settings: Any, tolerance: float, given: dict[str, Any]) -> Any:
     settings.solve_ncp = False  # without friction there is nothing to correct
     settings.max_iterations = MOST
     for name, value in given.items():
-        setattr(settings, name, getattr(pin.ADMMUpdateRule, value) if isinstance(value, str) else value)
+        setattr(
+            settings, name, getattr(pin.ADMMUpdateRule, value) if isinstance(value, str) else value
+        )
     return settings

@@ -1,8 +1,10 @@
-"""Solvers of quadratic programs: OSQP, ProxQP, Clarabel and PIQP, and the non-negative least squares of SciPy.
+"""Solvers of quadratic programs: OSQP, ProxQP, Clarabel and PIQP, and the non-negative least
+squares of SciPy.
 
-A solve begins with the sparse matrices and ends with the impulses, since in a flow all of them change from step to
-step: analysis and factors are part of it. Iterations are those that a package reports, and no two packages count the
-same.
+A solve begins with the sparse matrices and ends with the impulses, since in a flow all of them
+change from step to
+step: analysis and factors are part of it. Iterations are those that a package reports, and no two
+  packages count the same.
 """
 
 from typing import Any
@@ -22,7 +24,12 @@ from benchmarks.solvers.forms import columns, program_of, scaled, weighted
 LIMIT = 1.0  # seconds of a solve, where a package has a limit of time
 OSQP = {"adaptive_rho_interval": 25, "alpha": 1.8, "eps_dual_inf": 1e-8}
 # The back end that ProxQP chooses for large problems does not factor
-PROXQP = {"sparse_backend": "SparseCholesky", "max_iter": 100, "max_iter_in": 100, "eps_dual_inf": 1e-10}
+PROXQP = {
+    "sparse_backend": "SparseCholesky",
+    "max_iter": 100,
+    "max_iter_in": 100,
+    "eps_dual_inf": 1e-10,
+}
 CLARABEL = {"static_regularization_constant": 1e-12}
 _FREE = 1e20  # an upper bound that does not bind
 _LEAST_REST = 1e-12  # of the least-distance problem: less is none
@@ -33,7 +40,13 @@ def osqp(entry: Entry, tolerance: float) -> Solve:
     program = program_of(entry)
     p, g = columns(triu(program.p)), columns(eye_array(program.count))
     lower, upper = np.zeros(program.count), np.full(program.count, np.inf)
-    settings = {"eps_abs": tolerance, "eps_rel": 0.0, "max_iter": 20_000, "time_limit": LIMIT, "verbose": False} | OSQP
+    settings = {
+        "eps_abs": tolerance,
+        "eps_rel": 0.0,
+        "max_iter": 20_000,
+        "time_limit": LIMIT,
+        "verbose": False,
+    } | OSQP
 
     def solve() -> Answer | None:
         solver = osqp_package.OSQP()
@@ -47,14 +60,24 @@ def osqp(entry: Entry, tolerance: float) -> Solve:
 
 
 def proximal(entry: Entry, tolerance: float) -> Solve:
-    """Augmented Lagrangian with semismooth Newton steps, Bambade et al., Robotics: Science and Systems (2022)."""
+    """Augmented Lagrangian with semismooth Newton steps, Bambade et al., Robotics: Science and
+    Systems (2022).
+    """
     program = program_of(entry)
-    g, lower, upper = columns(eye_array(program.count)), np.zeros(program.count), np.full(program.count, _FREE)
+    g, lower, upper = (
+        columns(eye_array(program.count)),
+        np.zeros(program.count),
+        np.full(program.count, _FREE),
+    )
 
     def solve() -> Answer | None:
         solver = proxqp.sparse.QP(program.count, 0, program.count)
         for name, value in {"eps_abs": tolerance, "eps_rel": 0.0, **PROXQP}.items():
-            setattr(solver.settings, name, getattr(proxqp.SparseBackend, value) if isinstance(value, str) else value)
+            setattr(
+                solver.settings,
+                name,
+                getattr(proxqp.SparseBackend, value) if isinstance(value, str) else value,
+            )
         solver.init(program.p, program.q, None, None, g, lower, upper)
         solver.solve()
         if "INFEASIBLE" in str(solver.results.info.status):
@@ -76,7 +99,9 @@ def interior(entry: Entry, tolerance: float) -> Solve:
     cones = [clarabel.NonnegativeConeT(program.count)]
 
     def solve() -> Answer | None:
-        result = clarabel.DefaultSolver(p, program.q, g, np.zeros(program.count), cones, chosen).solve()
+        result = clarabel.DefaultSolver(
+            p, program.q, g, np.zeros(program.count), cones, chosen
+        ).solve()
         if "Infeasible" in str(result.status):
             return None
         return Answer(program.scale * np.maximum(np.array(result.x), 0), result.iterations)
@@ -95,7 +120,9 @@ def proximal_interior(entry: Entry, tolerance: float) -> Solve:
         solver = piqp_package.SparseSolver()
         for name, value in settings.items():
             setattr(solver.settings, name, value)
-        solver.setup(program.p, program.q, None, None, None, None, None, np.zeros(program.count), None)
+        solver.setup(
+            program.p, program.q, None, None, None, None, None, np.zeros(program.count), None
+        )
         if "INFEASIBLE" in str(solver.solve()):
             return None
         return Answer(program.scale * np.maximum(solver.result.x, 0), solver.result.info.iter)
@@ -106,8 +133,9 @@ def proximal_interior(entry: Entry, tolerance: float) -> Solve:
 def least_squares(entry: Entry, tolerance: float) -> Solve:
     """Non-negative least squares of SciPy, an active-set method, which has no tolerance.
 
-    With velocity changes as unknowns the problem is a least-distance problem: ‖Gᵀ y‖² + (h·y − 1)² with h = −u⁻ is
-    least over y ≥ 0 where p = y/(1 − h·y), and a vanishing rest 1 − h·y says that no velocities satisfy all contacts.
+    With velocity changes as unknowns the problem is a least-distance problem: ‖Gᵀ y‖² + (h·y − 1)²
+    with h = −u⁻ is least over y ≥ 0 where p = y/(1 − h·y), and a vanishing rest 1 − h·y says that
+    no velocities satisfy all contacts.
 
     Source: Lawson and Hanson, Solving Least Squares Problems (1974), chapter 23.
     """

@@ -15,7 +15,9 @@ PACKAGES = ("pin", "proxsuite", "osqp", "clarabel", "piqp", "scipy")
 
 
 class Solver(NamedTuple):
-    """A solver: how it is prepared, what its count means, and the settings that it does not have by default."""
+    """A solver: how it is prepared, what its count means, and the settings that it does not have by
+    default.
+    """
 
     prepare: Prepare
     counts: str
@@ -26,13 +28,23 @@ class Solver(NamedTuple):
 def our_solvers() -> dict[str, Solver]:
     """The solvers of this program, and plain Gauss–Seidel sweeps."""
     settings = {"jacobi": {"relaxation": 1.8}, "jacobi-count": {"relaxation": 1.8}}
-    settings |= {"jacobi-diagonal": {"relaxation": 1.0}}  # nothing bounds W there, so a longer step does harm alone
+    settings |= {
+        "jacobi-diagonal": {"relaxation": 1.0}
+    }  # nothing bounds W there, so a longer step does harm alone
     methods = {}
-    for name, method in {**SOLVERS, "jacobi-count": JacobiCount, "jacobi-diagonal": JacobiDiagonal}.items():
+    for name, method in {
+        **SOLVERS,
+        "jacobi-count": JacobiCount,
+        "jacobi-diagonal": JacobiDiagonal,
+    }.items():
         chosen = settings.get(name, {})
-        methods[name] = Solver(partial(projected, method(**chosen)), "products with W", chosen, True)
+        methods[name] = Solver(
+            partial(projected, method(**chosen)), "products with W", chosen, True
+        )
     return {
-        NUMBA_ENGINE: Solver(by_cluster, "sweeps or products with W of the slowest cluster", {}, True),
+        NUMBA_ENGINE: Solver(
+            by_cluster, "sweeps or products with W of the slowest cluster", {}, True
+        ),
         **methods,
         "Gauss–Seidel": Solver(swept, "sweeps", {}, True),
     }
@@ -47,7 +59,9 @@ def package_solvers() -> dict[str, Solver]:
     try:
         from benchmarks.solvers import pinocchio, quadratic
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f'{error.name} is missing: pip install "jaxgran[solver-peers]"') from error
+        raise ModuleNotFoundError(
+            f'{error.name} is missing: pip install "jaxgran[solver-peers]"'
+        ) from error
     return {
         "Pinocchio PGS": Solver(pinocchio.gauss_seidel, "sweeps", pinocchio.PGS),
         "Pinocchio ADMM": Solver(pinocchio.multipliers, "iterations", pinocchio.ADMM),

@@ -1,11 +1,13 @@
-"""Contact solvers side by side: this program's and those of other packages, on the collection of contact problems.
+"""Contact solvers side by side: this program's and those of other packages, on the collection of
+contact problems.
 
 python -m benchmarks solvers          # about 9 minutes
 python -m benchmarks solvers --quick  # every tenth problem and the smallest ones, under 3 minutes
 
-The other packages come with pip install "jaxgran[solver-peers]"; without them, this program's solvers are compared
-alone. All solve in this process, on one core, with one thread; times are those of the processor. A call from Python is
-part of them: about 2 µs for the numba engine, 80 µs for JAX, 300 µs for OSQP.
+The other packages come with pip install "jaxgran[solver-peers]"; without them, this program's
+solvers are compared alone. All solve in this process, on one core, with one thread; times are those
+of the processor. A call from Python is part of them: about 2 µs for the numba engine, 80 µs for
+JAX, 300 µs for OSQP.
 """
 
 import itertools
@@ -20,7 +22,14 @@ from benchmarks.networks import SLOTS
 from benchmarks.output import Output
 from benchmarks.solvers.groups import FLOWS, summary, table
 from benchmarks.solvers.measure import LIMIT, TARGETS, Attempt, run_solvers, stress_error
-from benchmarks.solvers.roster import DEFAULT, NUMBA_ENGINE, Solver, our_solvers, package_solvers, versions
+from benchmarks.solvers.roster import (
+    DEFAULT,
+    NUMBA_ENGINE,
+    Solver,
+    our_solvers,
+    package_solvers,
+    versions,
+)
 
 _QUICK_STEP, _QUICK_CONTACTS = 10, 600
 _AGREED = 1e-8  # residual of solutions whose velocities are compared
@@ -80,14 +89,17 @@ def compile_for(entries: Sequence[Entry], solvers: Mapping[str, Solver]) -> None
     """Compile ours for each of the shapes that problems are filled up to."""
     shapes = {}
     for entry in entries:
-        shapes.setdefault(min(slots for slots in SLOTS if slots >= len(entry.problem.approach)), entry)
+        shapes.setdefault(
+            min(slots for slots in SLOTS if slots >= len(entry.problem.approach)), entry
+        )
     for entry, solver in itertools.product(shapes.values(), solvers.values()):
         if solver.ours:
             solver.prepare(entry, 0.1)()
 
 
 def agreement(finest: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict]:
-    """Of each pair of solvers: problems that both solve to 1e-8, and the largest difference of velocities.
+    """Of each pair of solvers: problems that both solve to 1e-8, and the largest difference of
+    velocities.
 
     Velocities are in units of the fastest approach of the problem.
     """
@@ -98,14 +110,23 @@ def agreement(finest: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict]:
         if both:
             largest = max(float(np.max(np.abs(found[one] - found[other]))) for found in both)
             pairs.append(
-                {"solvers": [one, other], "problems": len(both), "largest_difference": float(f"{largest:.2g}")}
+                {
+                    "solvers": [one, other],
+                    "problems": len(both),
+                    "largest_difference": float(f"{largest:.2g}"),
+                }
             )
     return pairs
 
 
 def agreement_lines(pairs: Sequence[Mapping], solvers: Mapping[str, Solver]) -> str:
     """The agreement as text: the pairs of ours with others, and the worst of all."""
-    lines = ["largest difference of velocities between solutions to 1e-8, over the fastest approach"]
+    lines = [
+        "largest difference of velocities between solutions to 1e-8, over the fastest approach"
+    ]
     mixed = [pair for pair in pairs if sum(solvers[name].ours for name in pair["solvers"]) == 1]
-    lines += [f"{' / '.join(pair['solvers'])}: {pair['largest_difference']:.1e} ({pair['problems']})" for pair in mixed]
+    lines += [
+        f"{' / '.join(pair['solvers'])}: {pair['largest_difference']:.1e} ({pair['problems']})"
+        for pair in mixed
+    ]
     return "\n".join(lines)

@@ -1,8 +1,9 @@
 """The drawing of the folders of ``jaxgran`` and of the imports between them, made from the code.
 
-Every folder is a box. The rows are those that ``lint-imports`` checks (``pyproject.toml``). A line leaves a box to the
-right, and goes down into each folder that it imports; the number at the corner says how many files of the upper folder
-import the lower one. No import goes up, so the lower left of the drawing stays empty, and no line crosses a box.
+Every folder is a box. The rows are those that ``lint-imports`` checks (``pyproject.toml``). A line
+leaves a box to the right, and goes down into each folder that it imports; the number at the corner
+says how many files of the upper folder import the lower one. No import goes up, so the lower left
+of the drawing stays empty, and no line crosses a box.
 
     python docs/_build/architecture.py                # writes architecture.svg here
     python docs/_build/architecture.py drawing.png
@@ -61,7 +62,8 @@ def drawing() -> Figure:
     place = {name: k for k, name in enumerate(name for row in ordered for name in row)}
     unknown = sorted({name for arrow in arrows for name in arrow} - set(place))
     if unknown:
-        raise ValueError(f"the contract of the imports in pyproject.toml names no row for {', '.join(unknown)}.")
+        raise ValueError("the contract of the imports in pyproject.toml names no row for "
+                         f"{', '.join(unknown)}.")
     upward = [f"{upper} → {lower}" for upper, lower in arrows if place[upper] > place[lower]]
     if upward:
         raise ValueError(f"these imports go up, and cannot be drawn: {', '.join(upward)}.")
@@ -89,7 +91,8 @@ def _draw_box(axes: Axes, name: str, k: int) -> None:
 
 
 def _draw_imports(axes: Axes, k: int, imported: dict[int, int]) -> None:
-    """A line from the box to the right, and an arrow down from it into each box that is imported."""
+    """A line from the box to the right, and an arrow down from it into each box that is imported.
+    """
     if not imported:
         return
     y = -k * _BAND

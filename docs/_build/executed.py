@@ -1,7 +1,8 @@
 """Pages whose examples run when the site is built, each block followed by its output.
 
-The blocks of a page run in order, in a folder of their own: Python in one namespace, and commands of ``jaxgran`` in the
-shell. What a block prints is shown below it, and the Matplotlib figure that is the value of its last line.
+The blocks of a page run in order, in a folder of their own: Python in one namespace, and commands
+  of ``jaxgran`` in the shell. What a block prints is shown below it, and the Matplotlib figure that
+  is the value of its last line.
 """
 
 import ast
@@ -64,7 +65,8 @@ def _python(code: str, names: dict[str, Any]) -> tuple[str, bytes | None]:
 
 def _shell(code: str) -> str:
     """What commands of ``jaxgran`` print, in 80 columns; an error stops the build."""
-    environment = os.environ | {"COLUMNS": "80", "NO_COLOR": "1", "PYTHONPATH": str(ROOT)}  # of this checkout
+    # of this checkout
+    environment = os.environ | {"COLUMNS": "80", "NO_COLOR": "1", "PYTHONPATH": str(ROOT)}
     printed = []
     for words in map(shlex.split, code.replace("\\\n", " ").splitlines()):
         command = [sys.executable, "-m", *words]

@@ -1,8 +1,11 @@
-"""What the site shows from outside ``docs``: charts, notebooks, a drawing of the folders, and pages of its root.
+"""What the site shows from outside ``docs``: charts, notebooks, a drawing of the folders, and pages
+of its root.
 
-Charts come from ``benchmarks/results`` into ``charts`` of the site. The drawing of the folders, ``charts/architecture.svg``, is made from the imports of the code at every build, and
-``charts/paper.html`` from the dataset of the paper's map. Pages are templates (``benchmarks/pages.py``), and those of
-``executed.PAGES`` show what their examples print. A line between two ``$$`` is a formula of TeX.
+Charts come from ``benchmarks/results`` into ``charts`` of the site. The drawing of the folders,
+``charts/architecture.svg``, is made from the imports of the code at every build, and
+``charts/paper.html`` from the dataset of the paper's map. Pages are templates
+(``benchmarks/pages.py``), and those of ``executed.PAGES`` show what their examples print. A line
+between two ``$$`` is a formula of TeX.
 
 ==================  ================================================================================
 mark in a page      replaced by
@@ -116,7 +119,8 @@ def options(command: str) -> str:
         flag = f"-{one.short}, {option_name(name)}" if one.short else option_name(name)
         meaning = with_options(one.help, parameters(command)) + (f" In {one.unit}." if one.unit else "")
         if isinstance(one.kind, tuple):
-            flag, meaning = f"{flag} NAME", f"{meaning} One of {', '.join(f'`{choice}`' for choice in one.kind)}."
+            flag, meaning = f"{flag} NAME", (f"{meaning} One of "
+                                            f"{', '.join(f'`{choice}`' for choice in one.kind)}.")
         elif one.kind is not bool:
             flag = f"{flag} {placeholder(one)}".replace("|auto", " or auto")
         elif one.off:

@@ -1,7 +1,8 @@
 """Notebooks as pages: their text and code, and what they showed where they were run.
 
-The notebooks of the project have no outputs. The environment variable ``JAXGRAN_NOTEBOOKS`` names a folder with
-notebooks that were run (``pytest --nbmake --overwrite`` on a copy); their outputs are shown then.
+The notebooks of the project have no outputs. The environment variable ``JAXGRAN_NOTEBOOKS`` names a
+folder with notebooks that were run (``pytest --nbmake --overwrite`` on a copy); their outputs are
+shown then.
 """
 
 import base64
@@ -12,7 +13,8 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[2]
 RUN = "JAXGRAN_NOTEBOOKS"  # environment variable: folder of notebooks that were run
-LONGEST = 50_000  # characters of HTML that stand in the page itself; longer HTML is a file in a frame
+# characters of HTML that stand in the page itself; longer HTML is a file in a frame
+LONGEST = 50_000
 BARE = "*The site was built without running this notebook, so it has no outputs.*"
 NAMES = [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))]
 
@@ -31,7 +33,9 @@ def shown(name: str) -> Shown:
 
 
 def page_of(notebook: dict[str, Any], name: str) -> Shown:
-    """A notebook in the form of its JSON as a page; warnings are left out, as they name folders of a machine."""
+    """A notebook in the form of its JSON as a page; warnings are left out, as they name folders of
+    a machine.
+    """
     parts, files, run = [], {}, False
     for cell in notebook["cells"]:
         source = "".join(cell["source"])
@@ -56,11 +60,13 @@ def _output(output: dict[str, Any], name: str, files: dict[str, bytes]) -> str:
         files[f"{name}.png"] = base64.b64decode("".join(data["image/png"]))
         return f"![What the cell above draws]({name}.png)"
     html = "".join(data.get("text/html", ""))
-    if html and "xr-text-repr-fallback" not in html:  # xarray's needs a style sheet that the site overrides
+    # xarray's needs a style sheet that the site overrides
+    if html and "xr-text-repr-fallback" not in html:
         if len(html) <= LONGEST:
             return f'<div class="output">{html}</div>'
         files[f"{name}.html"] = html.encode()
-        return f'<iframe class="page" title="What the cell above shows" src="../{name}.html"></iframe>'
+        return ('<iframe class="page" title="What the cell above shows" '
+               f'src="../{name}.html"></iframe>')
     return _text(data.get("text/plain", ""))
 
 

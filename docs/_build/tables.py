@@ -1,7 +1,9 @@
-"""Docstrings as the site shows them: their tables between lines of ``====`` become tables of Markdown.
+"""Docstrings as the site shows them: their tables between lines of ``====`` become tables of
+Markdown.
 
-A table has a line of ``=`` above and below, and one more below its head if it has one. The gaps of that line are its
-columns. A row whose first column is empty goes on with the row before. Roles such as ``:func:`` lose their name.
+A table has a line of ``=`` above and below, and one more below its head if it has one. The gaps of
+that line are its columns. A row whose first column is empty goes on with the row before. Roles such
+as ``:func:`` lose their name.
 """
 
 import re

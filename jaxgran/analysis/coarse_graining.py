@@ -1,6 +1,7 @@
 """Coarse-graining functions, which spread a grain over the plane and a contact along its branch.
 
-Each is normalised in the plane and has a closed-form line integral. To add one, supply the four fields of ``Kernel``.
+Each is normalised in the plane and has a closed-form line integral. To add one, supply the four
+fields of ``Kernel``.
 """
 
 from collections.abc import Callable
@@ -19,16 +20,18 @@ _ON_CENTRE = 1e-100  # squared widths: a line with b² at or below this passes t
 
 
 class Kernel(NamedTuple):
-    """A coarse-graining function of unit width, g(q), normalised in the plane; all lengths are in widths.
+    """A coarse-graining function of unit width, g(q), normalised in the plane; all lengths are in
+    widths.
 
-    =============  ==============  ==========================================================================
+    =============  ==============  =================================================================
     field          signature       meaning
-    =============  ==============  ==========================================================================
+    =============  ==============  =================================================================
     value          q² → g          the function
-    line           s, b² → ()      ∫₀ˢ g(√(b² + t²)) dt along a line at the distance b from the centre
+    line           s, b² → ()      ∫₀ˢ g(√(b² + t²)) dt along a line at the distance b from the
+                                   centre
     second_moment  number          ∫ g q_x² d²q
     reach          number          distance beyond which g is zero or negligible
-    =============  ==============  ==========================================================================
+    =============  ==============  =================================================================
     """
 
     value: Callable[[Array], Array]
@@ -43,7 +46,9 @@ def _root(square: Array) -> Array:
 
 
 def _in_disc(s: Array, b2: Array) -> Array:
-    """s clipped to the chord of the unit disc at the distance b from the centre; zero outside the disc."""
+    """s clipped to the chord of the unit disc at the distance b from the centre; zero outside the
+    disc.
+    """
     half = jnp.sqrt(jnp.where(b2 < 1, 1 - b2, 1))
     return jnp.where(b2 < 1, jnp.clip(s, -half, half), 0)
 
@@ -56,8 +61,14 @@ def _lucy_line(s: Array, b2: Array) -> Array:
     s, off_centre = _in_disc(s, b2), b2 > _ON_CENTRE
     s2, b = s**2, jnp.sqrt(jnp.where(off_centre, b2, 1))
     q2 = b2 + s2
-    cubic = s * _root(q2) * (2 * q2 + 3 * b2) + jnp.where(off_centre, 3 * b2**2 * jnp.arcsinh(s / b), 0)  # 8 ∫ q³
-    return 5 / jnp.pi * (s - s * (6 * b2 + 2 * s2) + cubic - s * (3 * b2**2 + 2 * b2 * s2 + 0.6 * s2**2))
+    cubic = s * _root(q2) * (2 * q2 + 3 * b2) + jnp.where(
+        off_centre, 3 * b2**2 * jnp.arcsinh(s / b), 0
+    )  # 8 ∫ q³
+    return (
+        5
+        / jnp.pi
+        * (s - s * (6 * b2 + 2 * s2) + cubic - s * (3 * b2**2 + 2 * b2 * s2 + 0.6 * s2**2))
+    )
 
 
 GAUSSIAN = Kernel(
@@ -91,7 +102,10 @@ class CoarseGraining:
         return self.kernel.value((x * x + y * y) * per_width**2) * per_width**2
 
     def segment(
-        self, separations: Float[Array, "n 2"], normals: Float[Array, "n 2"], lengths: Float[Array, " n"]
+        self,
+        separations: Float[Array, "n 2"],
+        normals: Float[Array, "n 2"],
+        lengths: Float[Array, " n"],
     ) -> Float[Array, " n"]:
         """∫₀¹ G along branches, in 1/σ².
 
@@ -105,7 +119,12 @@ class CoarseGraining:
         """
         per_width, (x, y), (nx, ny) = 1 / self.width, separations.T, normals.T
         along, across, half = nx * x + ny * y, (nx * y - ny * x) * per_width, lengths / 2
-        start, end, line, b2 = (along - half) * per_width, (along + half) * per_width, self.kernel.line, across**2
+        start, end, line, b2 = (
+            (along - half) * per_width,
+            (along + half) * per_width,
+            self.kernel.line,
+            across**2,
+        )
         return (line(end, b2) - line(start, b2)) * (per_width / lengths)
 
     @property
@@ -120,12 +139,16 @@ class CoarseGraining:
 
 
 def gaussian(width: float | Array) -> CoarseGraining:
-    """The Gaussian exp(−r²/2w²)/2πw² of standard deviation w (σ); smooth, not truncated within the cell."""
+    """The Gaussian exp(−r²/2w²)/2πw² of standard deviation w (σ); smooth, not truncated within the
+    cell.
+    """
     return _of_width(width, GAUSSIAN)
 
 
 def lucy(radius: float | Array) -> CoarseGraining:
-    """Lucy's function 5/(πc²) (1 + 3r/c)(1 − r/c)³ inside a radius c (σ), with two continuous derivatives."""
+    """Lucy's function 5/(πc²) (1 + 3r/c)(1 − r/c)³ inside a radius c (σ), with two continuous
+    derivatives.
+    """
     return _of_width(radius, LUCY)
 
 

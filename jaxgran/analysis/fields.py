@@ -1,18 +1,20 @@
-"""Coarse-grained fields of a snapshot: density, velocity, stress, dissipation and heat flux at any points.
+"""Coarse-grained fields of a snapshot: density, velocity, stress, dissipation and heat flux at any
+points.
 
-A coarse-graining function G spreads every grain over the plane. Quantities carried by grains are weighted by
-G(r − r_i), quantities transferred by contacts by ∫₀¹ G(r − r_i + s σ_ij) ds, the mean of G over the branch
-σ_ij = r_i − r_j between the centres. With these weights the fields obey the balance equations of mass, momentum and
-energy exactly, at every point and for every G:
+A coarse-graining function G spreads every grain over the plane. Quantities carried by grains are
+weighted by G(r − r_i), quantities transferred by contacts by ∫₀¹ G(r − r_i + s σ_ij) ds, the mean
+of G over the branch σ_ij = r_i − r_j between the centres. With these weights the fields obey the
+balance equations of mass, momentum and energy exactly, at every point and for every G:
 
     ∂ρ/∂t = −∇·(ρV),   ∂(ρV)/∂t = −∇·(ρVV + Σ),   ∂(ρe)/∂t = −∇·(ρeV + Σ·V + J_Q) − ζ.
 
-A time step is an instantaneous collision followed by a flight. Quantities carried by grains use the velocities after
-the collision; forces are impulses over dt. The fields of a snapshot are those of the step that begins with it, over
-which the densities change by dt times the right-hand sides: exactly for contacts, to first order in dt for flight.
+A time step is an instantaneous collision followed by a flight. Quantities carried by grains use the
+velocities after the collision; forces are impulses over dt. The fields of a snapshot are those of
+the step that begins with it, over which the densities change by dt times the right-hand sides:
+exactly for contacts, to first order in dt for flight.
 
-Sources: Lois, Lemaître and Carlson for ρ, ρV and Σ (their energy equation has the opposite signs on the right);
-Goldhirsch and Goldenberg, Eur. Phys. J. E 9, 245 (2002), for the line integral.
+Sources: Lois, Lemaître and Carlson for ρ, ρV and Σ (their energy equation has the opposite signs on
+  the right); Goldhirsch and Goldenberg, Eur. Phys. J. E 9, 245 (2002), for the line integral.
 """
 
 from dataclasses import dataclass
@@ -41,21 +43,25 @@ _dot = partial(jnp.dot, precision=lax.Precision.HIGHEST)
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Fields:
-    """Coarse-grained fields at points of the plane, in the laboratory frame (mean velocity γ̇ y x̂).
+    """Coarse-grained fields at points of the plane, in the laboratory frame (mean velocity γ̇ y
+    x̂).
 
-    ==============  ==============  =======  ===========================================================================
+    ==============  ==============  =======  =======================================================
     field           shape           unit     meaning
-    ==============  ==============  =======  ===========================================================================
+    ==============  ==============  =======  =======================================================
     density         (points,)       m/σ²     ρ = Σ m G
     number_density  (points,)       1/σ²     Σ G
     velocity        (points, 2)     σγ̇       V = Σ m v G / ρ; the mean flow γ̇ y x̂ where ρ = 0
     kinetic_stress  (points, 2, 2)  mγ̇²      Σ m (v − V)(v − V) G
     contact_stress  (points, 2, 2)  mγ̇²      Σ σ F ∫G over the contacts; positive for pressure
-    heat_flux       (points, 2)     mσγ̇³     J_Q = ½ Σ m |v − V|² (v − V) G + Σ σ F·((v̄_i + v̄_j)/2 − V) ∫G, with v̄ the
+    heat_flux       (points, 2)     mσγ̇³     J_Q = ½ Σ m |v − V|² (v − V) G + Σ σ F·((v̄_i +
+                                             v̄_j)/2 − V) ∫G, with v̄ the
                                              mean of the velocities before and after the collision
-    dissipation     (points,)       mγ̇³      ζ: energy lost in contacts, half of each loss at either grain; negative
-                                             where a contact gains energy because its neighbours compress it
-    ==============  ==============  =======  ===========================================================================
+    dissipation     (points,)       mγ̇³      ζ: energy lost in contacts, half of each loss at
+                                             either grain; negative
+                                             where a contact gains energy because its neighbours
+                                             compress it
+    ==============  ==============  =======  =======================================================
     """
 
     density: Float[Array, " points"]
@@ -85,14 +91,19 @@ class Fields:
 
     @property
     def temperature(self) -> Float[Array, " points"]:
-        """Granular temperature tr Σ_k / (2 Σ G), in mσ²γ̇², with Σ_k the kinetic stress; zero where no grain is near."""
+        """Granular temperature tr Σ_k / (2 Σ G), in mσ²γ̇², with Σ_k the kinetic stress; zero where
+        no grain is near.
+        """
         number = jnp.where(self.number_density > 0, self.number_density, 1)
         return jnp.trace(self.kinetic_stress, axis1=1, axis2=2) / (2 * number)
 
     @property
     def energy(self) -> Float[Array, " points"]:
         """Energy density ρe = Σ ½ m v² G, in mγ̇²."""
-        return (jnp.sum(self.momentum * self.velocity, axis=1) + jnp.trace(self.kinetic_stress, axis1=1, axis2=2)) / 2
+        return (
+            jnp.sum(self.momentum * self.velocity, axis=1)
+            + jnp.trace(self.kinetic_stress, axis1=1, axis2=2)
+        ) / 2
 
     @property
     def energy_flux(self) -> Float[Array, "points 2"]:
@@ -104,14 +115,15 @@ class Fields:
 class _Branches(NamedTuple):
     """Branches of contacts and the quantities transferred along them.
 
-    ===========  =============  ==============================================================================
+    ===========  =============  ====================================================================
     middles      (contacts, 2)  middle of the branch, σ
     normals      (contacts, 2)  unit vector along the branch
     lengths      (contacts,)    length of the branch, σ
-    transferred  (contacts, 6)  the four components of σ F, and the two of σ (F·c̄); F is the force, c̄ the mean
+    transferred  (contacts, 6)  the four components of σ F, and the two of σ (F·c̄); F is the force,
+                                c̄ the mean
                                 of the velocities of both grains before and after the collision
     loaded       (contacts,)    whether the contact carries an impulse
-    ===========  =============  ==============================================================================
+    ===========  =============  ====================================================================
     """
 
     middles: Float[Array, "contacts 2"]
@@ -121,8 +133,11 @@ class _Branches(NamedTuple):
     loaded: Bool[Array, " contacts"]
 
 
-def fields_at(snapshot: Snapshot, points: Float[Array, "points 2"], graining: CoarseGraining) -> Fields:
-    """Fields of a snapshot at any points of the plane; supports ``jit``, ``lax.map`` and differentiation.
+def fields_at(
+    snapshot: Snapshot, points: Float[Array, "points 2"], graining: CoarseGraining
+) -> Fields:
+    """Fields of a snapshot at any points of the plane; supports ``jit``, ``lax.map`` and
+    differentiation.
 
     Args:
       snapshot: one snapshot.
@@ -133,22 +148,27 @@ def fields_at(snapshot: Snapshot, points: Float[Array, "points 2"], graining: Co
       Fields of the step that begins with the snapshot; ρ, V and Σ_k are those after its collision.
 
     Raises:
-      InputError: the width is not positive, or G reaches beyond half the side minus the largest radius, so that two
-        images of a grain would be within reach of a point. The reach of a Gaussian is six widths, where it has
-        fallen to e⁻¹⁸ = 1.5e-8 of its peak.
+      InputError: the width is not positive, or G reaches beyond half the side minus the largest
+        radius, so that two images of a grain would be within reach of a point. The reach of a
+        Gaussian is six widths, where it has fallen to e⁻¹⁸ = 1.5e-8 of its peak.
     """
     if not isinstance(snapshot, Snapshot) or jnp.ndim(snapshot.state.positions) != 2:
-        raise InputError("snapshot must be a single Snapshot; series[-1] is the last one of a series.")
+        raise InputError(
+            "snapshot must be a single Snapshot; series[-1] is the last one of a series."
+        )
     if not isinstance(graining, CoarseGraining):
         raise InputError(f"graining must come from gaussian or lucy, not {short_repr(graining)}.")
     points, accepted = as_array(points), "an array (points, 2) of finite numbers"
-    require("points", points, lambda x: x.ndim == 2 and x.shape[1] == 2 and np.isfinite(x), accepted)
+    require(
+        "points", points, lambda x: x.ndim == 2 and x.shape[1] == 2 and np.isfinite(x), accepted
+    )
     _check(graining, snapshot.state)
     return _fields_at(snapshot, points, graining)
 
 
 def grid(side: float | Array, count: int) -> Float[Array, "points 2"]:
-    """A regular grid of points (count², 2) in the cell, row by row: ``reshape(count, count)`` gives axes (y, x).
+    """A regular grid of points (count², 2) in the cell, row by row: ``reshape(count, count)`` gives
+    axes (y, x).
 
     The square [0, L)² is one cell of the sheared lattice at any tilt.
     """
@@ -159,9 +179,16 @@ def grid(side: float | Array, count: int) -> Float[Array, "points 2"]:
 def _check(graining: CoarseGraining, state: State) -> None:
     limit = np.inf
     if not isinstance(state.side, Tracer) and not isinstance(state.grains.radii, Tracer):
-        limit = (float(state.side) / 2 - np.max(np.asarray(state.grains.radii))) / graining.kernel.reach
+        limit = (
+            float(state.side) / 2 - np.max(np.asarray(state.grains.radii))
+        ) / graining.kernel.reach
     accepted = f"positive and at most {limit:.4g} in this cell"
-    require("the width of the coarse-graining", graining.width, lambda w: (w > 0) & (w <= limit), accepted)
+    require(
+        "the width of the coarse-graining",
+        graining.width,
+        lambda w: (w > 0) & (w <= limit),
+        accepted,
+    )
 
 
 @jax.jit
@@ -173,7 +200,8 @@ def _fields_at(snapshot: Snapshot, points: Array, graining: CoarseGraining) -> F
     forces = contacts.normals * (snapshot.impulses / snapshot.timestep)[:, None]
 
     power_lost = (
-        -jnp.sum(forces * (velocity_i - velocity_j), axis=1) - snapshot.shear_rate * forces[:, 0] * branches[:, 1]
+        -jnp.sum(forces * (velocity_i - velocity_j), axis=1)
+        - snapshot.shear_rate * forces[:, 0] * branches[:, 1]
     )
     loss = power_lost / 2  # half of the loss goes to each of the two grains
     losses = jnp.zeros_like(before.grains.masses).at[contacts.i].add(loss).at[contacts.j].add(loss)
@@ -182,8 +210,12 @@ def _fields_at(snapshot: Snapshot, points: Array, graining: CoarseGraining) -> F
     work = branches * jnp.sum(forces * (velocity_i + velocity_j) / 2, axis=1)[:, None]
     transferred = jnp.concatenate([stress.reshape(-1, 4), work], axis=1)
     middles = before.positions[contacts.j] + branches / 2
-    transfers = _Branches(middles, contacts.normals, contacts.distances, transferred, snapshot.impulses > 0)
-    return _coarse_grained(after, losses, _in_blocks(transfers), snapshot.shear_rate, points, graining)
+    transfers = _Branches(
+        middles, contacts.normals, contacts.distances, transferred, snapshot.impulses > 0
+    )
+    return _coarse_grained(
+        after, losses, _in_blocks(transfers), snapshot.shear_rate, points, graining
+    )
 
 
 def _in_blocks(branches: _Branches) -> _Branches:
@@ -193,19 +225,30 @@ def _in_blocks(branches: _Branches) -> _Branches:
     order = jnp.pad(order, (0, -order.size % size), constant_values=order.size).reshape(-1, size)
     ordered = jax.tree.map(lambda x: x[jnp.minimum(order, branches.loaded.size - 1)], branches)
     loaded = ordered.loaded & (order < branches.loaded.size)
-    return ordered._replace(loaded=loaded, transferred=jnp.where(loaded[:, :, None], ordered.transferred, 0))
+    return ordered._replace(
+        loaded=loaded, transferred=jnp.where(loaded[:, :, None], ordered.transferred, 0)
+    )
 
 
 def _coarse_grained(
-    state: State, losses: Array, blocks: _Branches, shear_rate: Array, points: Array, graining: CoarseGraining
+    state: State,
+    losses: Array,
+    blocks: _Branches,
+    shear_rate: Array,
+    points: Array,
+    graining: CoarseGraining,
 ) -> Fields:
-    """The fields, written for one point; ``lax.map`` evaluates batches of points as matrix products.
+    """The fields, written for one point; ``lax.map`` evaluates batches of points as matrix
+    products.
 
-    Sums are taken in the frame of the mean flow at the point, where an image at the separation d has the velocity
-    w = c − γ̇ d_y x̂: images need no correction, and no digits cancel far from the origin.
+    Sums are taken in the frame of the mean flow at the point, where an image at the separation d
+    has the velocity w = c − γ̇ d_y x̂: images need no correction, and no digits cancel far from the
+    origin.
     """
     masses, (cx, cy) = state.grains.masses, state.velocities.T
-    carried = jnp.stack([masses, masses * cy, masses * cy**2, masses * cy**3, jnp.ones_like(cy), losses], axis=1)
+    carried = jnp.stack(
+        [masses, masses * cy, masses * cy**2, masses * cy**3, jnp.ones_like(cy), losses], axis=1
+    )
 
     def transferred_at(point: Array) -> Float[Array, "2 6"]:
         def add_block(sums: Array, block: _Branches) -> tuple[Array, None]:
@@ -229,7 +272,11 @@ def _coarse_grained(
         w = jnp.stack([x, y]) / jnp.where(rho > 0, rho, 1)
         kinetic_stress = jnp.stack([xx, xy, xy, yy]).reshape(2, 2) - rho * w[:, None] * w[None, :]
         contact_stress = transferred[:4].reshape(2, 2)
-        energy_flux = jnp.stack([xxx + xyy, xxy + yyy]) / 2 + transferred[4:] - shear_rate * first_moment[0:4:2]
+        energy_flux = (
+            jnp.stack([xxx + xyy, xxy + yyy]) / 2
+            + transferred[4:]
+            - shear_rate * first_moment[0:4:2]
+        )
         heat_flux = energy_flux - (xx + yy) / 2 * w - _dot(kinetic_stress + contact_stress, w)
         velocity = w + shear_rate * jnp.stack([point[1], jnp.zeros_like(rho)])
         return Fields(rho, number, velocity, kinetic_stress, contact_stress, heat_flux, loss)

@@ -1,6 +1,7 @@
 """Force chains: clusters of grains in loaded contact, and their forces.
 
-A contact is *loaded* if it carries an impulse. A *cluster* is a set of grains connected by loaded contacts.
+A contact is *loaded* if it carries an impulse. A *cluster* is a set of grains connected by loaded
+contacts.
 """
 
 from typing import NamedTuple
@@ -24,17 +25,27 @@ class Loaded(NamedTuple):
     distances: Float[np.ndarray, " loaded"]  # of the centres, in σ
 
     def moments(self) -> Float[np.ndarray, "loaded 2 2"]:
-        """σ^a F^b of each contact, in mσ²γ̇². The contact stress is their sum divided by the area of the cell."""
-        return (self.force * self.distances)[:, None, None] * self.normals[:, :, None] * self.normals[:, None, :]
+        """σ^a F^b of each contact, in mσ²γ̇². The contact stress is their sum divided by the area
+        of the cell.
+        """
+        return (
+            (self.force * self.distances)[:, None, None]
+            * self.normals[:, :, None]
+            * self.normals[:, None, :]
+        )
 
 
 class PairForces(NamedTuple):
-    """Pairs of grains in loaded contact at any time of a series, and their mean forces over the series."""
+    """Pairs of grains in loaded contact at any time of a series, and their mean forces over the
+    series.
+    """
 
     i: Int[np.ndarray, " pairs"]
     j: Int[np.ndarray, " pairs"]  # > i
     force: Float[np.ndarray, " pairs"]  # mean of p/dt over all snapshots, loaded or not, in mσγ̇²
-    cluster_share: Float[np.ndarray, " pairs"]  # share of it that acts within clusters of three or more grains
+    cluster_share: Float[
+        np.ndarray, " pairs"
+    ]  # share of it that acts within clusters of three or more grains
 
 
 class Clusters(NamedTuple):
@@ -45,10 +56,12 @@ class Clusters(NamedTuple):
 
 
 class ClusterShare(NamedTuple):
-    """Shares of loaded contacts, and of their force, pressure and shear stress, in clusters of three or more grains.
+    """Shares of loaded contacts, and of their force, pressure and shear stress, in clusters of
+    three or more grains.
 
-    Each is a scalar over the whole series. The contact pressure is Σ tr(σF)/2, the contact shear stress −Σ σ^x F^y. In
-    a cluster of two, a binary collision, F = F_bc exactly: only larger ones raise the force ratio above 1.
+    Each is a scalar over the whole series. The contact pressure is Σ tr(σF)/2, the contact shear
+    stress −Σ σ^x F^y. In a cluster of two, a binary collision, F = F_bc exactly: only larger ones
+    raise the force ratio above 1.
     """
 
     contacts: Measured
@@ -63,7 +76,9 @@ def loaded_contacts(snapshots: Snapshot) -> Loaded:
     time, slot = np.nonzero(frames.contacts.used & (frames.impulses > 0))
     force = frames.impulses[time, slot] / frames.timestep[time]
     picked = (x[time, slot] for x in (frames.contacts.normals, frames.contacts.distances))
-    return Loaded(time, frames.contacts.i[time, slot], frames.contacts.j[time, slot], force, *picked)
+    return Loaded(
+        time, frames.contacts.i[time, slot], frames.contacts.j[time, slot], force, *picked
+    )
 
 
 def clusters(snapshots: Snapshot) -> Clusters:
@@ -76,13 +91,17 @@ def clusters(snapshots: Snapshot) -> Clusters:
 
 
 def pair_forces(snapshots: Snapshot) -> PairForces:
-    """Mean force of each pair over a series; with a snapshot every time step, its impulse over the elapsed time."""
+    """Mean force of each pair over a series; with a snapshot every time step, its impulse over the
+    elapsed time.
+    """
     load, sizes = loaded_contacts(snapshots), clusters(snapshots).sizes
     times, grains = sizes.shape
     keys = np.minimum(load.i, load.j).astype(np.int64) * grains + np.maximum(load.i, load.j)
     pairs, pair = np.unique(keys, return_inverse=True)
     in_cluster = sizes[load.time, load.i] > 2
-    total, clustered = (np.bincount(pair, load.force * w, minlength=pairs.size) for w in (1, in_cluster))
+    total, clustered = (
+        np.bincount(pair, load.force * w, minlength=pairs.size) for w in (1, in_cluster)
+    )
     return PairForces(pairs // grains, pairs % grains, total / times, ratio(clustered, total))
 
 

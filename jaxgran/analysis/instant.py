@@ -1,4 +1,6 @@
-"""An instant of a flow on the host: positions and speeds of its grains, and the forces between them."""
+"""An instant of a flow on the host: positions and speeds of its grains, and the forces between
+them.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -27,7 +29,9 @@ class Instant(NamedTuple):
 
 
 def instant_of(frame: Snapshot) -> Instant:
-    """The instant of one snapshot, with the forces of its time step; of a series of successive ones as ``averaged``."""
+    """The instant of one snapshot, with the forces of its time step; of a series of successive ones
+    as ``averaged``.
+    """
     if np.ndim(frame.state.side):
         return averaged([instant_of(frame[k]) for k in range(len(frame))])
     arrays = jax.tree.map(np.asarray, frame)
@@ -46,13 +50,18 @@ def instant_of(frame: Snapshot) -> Instant:
 
 
 def averaged(instants: Sequence[Instant]) -> Instant:
-    """One instant from those of successive time steps: grains of the middle one, forces averaged over all."""
+    """One instant from those of successive time steps: grains of the middle one, forces averaged
+    over all.
+    """
     middle = instants[len(instants) // 2]
     pairs, force, clustered = (
-        np.concatenate([getattr(one, name) for one in instants]) for name in ("pairs", "force", "clustered")
+        np.concatenate([getattr(one, name) for one in instants])
+        for name in ("pairs", "force", "clustered")
     )
     distinct, pair = np.unique(pairs, axis=0, return_inverse=True)
-    total, in_clusters = (np.bincount(pair.ravel(), force * w, minlength=len(distinct)) for w in (1, clustered))
+    total, in_clusters = (
+        np.bincount(pair.ravel(), force * w, minlength=len(distinct)) for w in (1, clustered)
+    )
     return middle._replace(
         pairs=distinct,
         force=total / len(instants),

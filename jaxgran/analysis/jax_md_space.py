@@ -1,4 +1,6 @@
-"""The sheared cell of a state as jax-md knows a space, so that its functions apply to our states."""
+"""The sheared cell of a state as jax-md knows a space, so that its functions apply to our
+states.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,13 +16,13 @@ from jaxgran.model.state import State
 class JaxMdSpace(NamedTuple):
     """A space of jax-md.
 
-    ============  ==================  ===========================================================================
+    ============  ==================  ==============================================================
     field         called or shaped    meaning
-    ============  ==================  ===========================================================================
+    ============  ==================  ==============================================================
     displacement  (to, origin)        shortest separation ``to − origin`` in the sheared cell, σ
     shift         (positions, steps)  the positions after the steps, wrapped into the cell, σ
     box           (2, 2)              its columns are the lattice vectors (L, 0) and (tilt·L, L), σ
-    ============  ==================  ===========================================================================
+    ============  ==================  ==============================================================
     """
 
     displacement: Callable[..., Array]
@@ -31,13 +33,15 @@ class JaxMdSpace(NamedTuple):
 def jax_md_space(state: State) -> JaxMdSpace:
     """Displacement and shift functions of the sheared cell of a state, and its box, for jax-md.
 
-    Positions are those of the state, in σ, not fractions of the cell. Both functions take ``box=``, for a cell that has
-    been sheared on, and the displacement also ``perturbation=``, by which jax-md's ``quantity.stress`` deforms the
-    cell. Separations are exact below half the side. ``jit``, ``vmap`` and derivatives apply, also those with respect to
-    side and tilt, which jax-md's ``periodic_general`` gets wrong.
+    Positions are those of the state, in σ, not fractions of the cell. Both functions take ``box=``,
+    for a cell that has been sheared on, and the displacement also ``perturbation=``, by which
+    jax-md's ``quantity.stress`` deforms the cell. Separations are exact below half the side.
+    ``jit``, ``vmap`` and derivatives apply, also those with respect to side and tilt, which
+    jax-md's ``periodic_general`` gets wrong.
 
-    Neighbour lists in these coordinates compare all pairs: give ``disable_cell_list=True``. An update does not see a
-    shear of the box, so allocate the list anew, or update it with a ``dr_threshold`` of zero.
+    Neighbour lists in these coordinates compare all pairs: give ``disable_cell_list=True``. An
+      update does not see a shear of the box, so allocate the list anew, or update it with a
+      ``dr_threshold`` of zero.
 
     Args:
       state: gives side and tilt; it may be traced, but is one replica.
@@ -49,7 +53,8 @@ def jax_md_space(state: State) -> JaxMdSpace:
       >>> from jaxgran.model.grains import Grains
       >>> grains = Grains(jnp.full(2, 0.5), jnp.ones(2))
       >>> positions = jnp.asarray([[0.5, 9.5], [0.5, 0.5]])
-      >>> state = State(grains, positions, jnp.zeros((2, 2)), side=jnp.asarray(10.0), tilt=jnp.asarray(0.25))
+      >>> side, tilt = jnp.asarray(10.0), jnp.asarray(0.25)
+      >>> state = State(grains, positions, jnp.zeros((2, 2)), side, tilt)
       >>> displacement, shift, box = jax_md_space(state)
       >>> displacement(*positions).tolist(), box.tolist()
       ([-2.5, -1.0], [[10.0, 2.5], [0.0, 10.0]])
@@ -60,7 +65,9 @@ def jax_md_space(state: State) -> JaxMdSpace:
     def side_and_tilt(box: Array | None) -> tuple[Array, Array]:
         return (state.side, state.tilt) if box is None else (box[1, 1], box[0, 1] / box[1, 1])
 
-    def displacement_in(to: Array, origin: Array, box: Any = None, perturbation: Any = None, **_: Any) -> Array:
+    def displacement_in(
+        to: Array, origin: Array, box: Any = None, perturbation: Any = None, **_: Any
+    ) -> Array:
         separation = displacement(to, origin, *side_and_tilt(box))
         if perturbation is None:
             return separation

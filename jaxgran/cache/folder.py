@@ -1,4 +1,6 @@
-"""The folder of the compilation cache: in the user's cache folder, or a temporary one if that is not writable."""
+"""The folder of the compilation cache: in the user's cache folder, or a temporary one if that is
+not writable.
+"""
 
 import os
 import stat
@@ -17,11 +19,12 @@ _SHORTEST_COMPILATION = 0.3  # seconds; faster compilations are not cached
 def use_cache() -> None:
     """Keep compiled programs on disk from now on, so that later processes start without compiling.
 
-    It sets JAX's ``jax_compilation_cache_dir`` to a folder in the user's cache folder, one for each kind of processor,
-    and ``jax_persistent_cache_min_compile_time_secs`` to 0.3. Programs of the user are then kept, too. A folder that
-    JAX has already, and a cache that ``jax_enable_compilation_cache`` turns off, are left as they are. If the user's
-    cache folder is not writable, a temporary one is used and a warning names it. Call it before the first computation;
-    the command line does.
+    It sets JAX's ``jax_compilation_cache_dir`` to a folder in the user's cache folder, one for each
+    kind of processor, and ``jax_persistent_cache_min_compile_time_secs`` to 0.3. Programs of the
+    user are then kept, too. A folder that JAX has already, and a cache that
+    ``jax_enable_compilation_cache`` turns off, are left as they are. If the user's cache folder is
+    not writable, a temporary one is used and a warning names it. Call it before the first
+    computation; the command line does.
     """
     import jax
 
@@ -35,7 +38,9 @@ def use_cache() -> None:
         return
     config.update("jax_compilation_cache_dir", str(folder / processor_kind()))
     config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST_COMPILATION)
-    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1" and default_device().platform == "cpu":  # JAX itself sets 1
+    if (
+        os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1" and default_device().platform == "cpu"
+    ):  # JAX itself sets 1
         _silence_loader(config)
 
 
@@ -49,7 +54,8 @@ def programs_folder() -> Path | None:
 
 
 def _silence_loader(config: Any) -> None:
-    """Keep XLA from logging a long, harmless error for each program that it loads: it takes tuning hints for features.
+    """Keep XLA from logging a long, harmless error for each program that it loads: it takes tuning
+    hints for features.
 
     JAX sets the level of XLA's log together with that of its own, but sets back only its own.
     """
@@ -60,13 +66,20 @@ def _silence_loader(config: Any) -> None:
 
 
 def fallback_message() -> str:
-    """One sentence that says why the user's cache folder is not used and what is used instead; "" if it is used."""
+    """One sentence that says why the user's cache folder is not used and what is used instead; ""
+    if it is used.
+    """
     folder = cache_folder()
     if folder == users_folder():
         return ""
-    instead = "every run compiles anew" if folder is None else f"compiled programs are kept in {str(folder)!r}"
+    instead = (
+        "every run compiles anew"
+        if folder is None
+        else f"compiled programs are kept in {str(folder)!r}"
+    )
     return (
-        f"the cache folder {str(users_folder())!r} cannot be written ({why_unwritable(users_folder())}), so {instead}; "
+        f"the cache folder {str(users_folder())!r} cannot be written "
+        f"({why_unwritable(users_folder())}), so {instead}; "
         "XDG_CACHE_HOME may name another."
     )
 
@@ -82,7 +95,9 @@ def cache_folder() -> Path | None:
 
 
 def why_unwritable(folder: Path) -> str:
-    """The reason why no file can be written to a folder, which is created if missing; "" if it is writable."""
+    """The reason why no file can be written to a folder, which is created if missing; "" if it is
+    writable.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -92,7 +107,8 @@ def why_unwritable(folder: Path) -> str:
 
 
 def _temporary_folder() -> Path | None:
-    """This user's folder in the temporary directory, the same in every process; None if it is not safe to use.
+    """This user's folder in the temporary directory, the same in every process; None if it is not
+    safe to use.
 
     Cached programs are executed later, so no other user may be able to write there.
     """

@@ -1,8 +1,10 @@
-"""``jit`` with compiled programs on disk, so that a new process need neither trace nor compile them.
+"""``jit`` with compiled programs on disk, so that a new process need neither trace nor compile
+them.
 
-JAX caches compiled programs too, but to look one up it must first trace and lower the function, which takes seconds.
-Here the key needs no tracing: the sources of this package, versions, flags, and the shapes of the arguments. Programs
-are stored inside JAX's cache folder, and only for a single CPU device.
+JAX caches compiled programs too, but to look one up it must first trace and lower the function,
+which takes seconds. Here the key needs no tracing: the sources of this package, versions, flags,
+and the shapes of the arguments. Programs are stored inside JAX's cache folder, and only for a
+single CPU device.
 """
 
 import hashlib
@@ -31,16 +33,22 @@ _MOST_PROGRAMS = 64  # of up to 4 MB each
 _PACKAGES = ("jax", "jaxlib", "numpy")
 _CUSTOM_CALL = re.compile(r"stablehlo\.custom_call @(\w+)")
 _MIN_COMPILE_TIME = "jax_persistent_cache_min_compile_time_secs"
-_FIRST_CALL = RLock()  # several threads load or compile a program once, and change JAX's flags in turn
-_SAFE_CALLS = ("jaxgran_advance", "Sharding")  # others need a library that JAX loads only on lowering
+_FIRST_CALL = (
+    RLock()
+)  # several threads load or compile a program once, and change JAX's flags in turn
+_SAFE_CALLS = (
+    "jaxgran_advance",
+    "Sharding",
+)  # others need a library that JAX loads only on lowering
 
 
 def persistent_jit(function: Callable, register: Callable[[], None] = lambda: None) -> Callable:
-    """``jax.jit`` of a function, with its compiled programs cached on disk, after a call of ``use_cache``.
+    """``jax.jit`` of a function, with its compiled programs cached on disk, after a call of
+    ``use_cache``.
 
     Args:
-      function: a function of pytrees of arrays, without static arguments. JAX's flags are read at the first call with
-        arguments of given shapes.
+      function: a function of pytrees of arrays, without static arguments. JAX's flags are read at
+        the first call with arguments of given shapes.
       register: called before loading a program that calls the numba engine.
     """
     jitted = jax.jit(function)
@@ -50,7 +58,11 @@ def persistent_jit(function: Callable, register: Callable[[], None] = lambda: No
     def call(*arguments):
         leaves, structure = jax.tree.flatten(arguments)
         folder = _folder()
-        if folder is None or any(isinstance(leaf, Tracer) for leaf in leaves) or _has_foreign_class(structure):
+        if (
+            folder is None
+            or any(isinstance(leaf, Tracer) for leaf in leaves)
+            or _has_foreign_class(structure)
+        ):
             return jitted(*arguments)
         key = (structure, tuple(map(jax.typeof, leaves)))
         if key not in programs:
@@ -74,15 +86,22 @@ def _folder() -> Path | None:
 
 
 def _has_foreign_class(structure: Any) -> bool:
-    """Whether an argument is of a class from outside, such as a user's solver, whose source is not in the key."""
+    """Whether an argument is of a class from outside, such as a user's solver, whose source is not
+    in the key.
+    """
     node = structure.node_data()
-    foreign = node is not None and node[0].__module__.partition(".")[0] not in ("builtins", "jaxgran")
+    foreign = node is not None and node[0].__module__.partition(".")[0] not in (
+        "builtins",
+        "jaxgran",
+    )
     return foreign or any(map(_has_foreign_class, structure.children()))
 
 
 def _flags() -> str:
     """All flags of JAX, since a program may depend on any of them."""
-    return repr(sorted((name, repr(x)) for name, x in jax.config.values.items() if "cache" not in name))
+    return repr(
+        sorted((name, repr(x)) for name, x in jax.config.values.items() if "cache" not in name)
+    )
 
 
 @cache
@@ -128,12 +147,15 @@ def _compile(jitted: Any, arguments: tuple, path: Path) -> Callable:
         return lowered.compile()
     with _jax_cache_read_only() as cache_hits:
         program = lowered.compile()
-    if not cache_hits:  # a program from JAX's cache cannot be serialised again: XLA omits part of it
+    if (
+        not cache_hits
+    ):  # a program from JAX's cache cannot be serialised again: XLA omits part of it
         try:
             write_cached(path, pickle.dumps((bool(called), *serialize(program))), _MOST_PROGRAMS)
         except OSError as error:
             warnings.warn(
-                f"compiled programs are not cached: {str(path.parent)!r} cannot be written ({error.strerror}).",
+                f"compiled programs are not cached: {str(path.parent)!r} cannot be written "
+                f"({error.strerror}).",
                 stacklevel=3,
             )
     return program
@@ -141,7 +163,9 @@ def _compile(jitted: Any, arguments: tuple, path: Path) -> Callable:
 
 @contextmanager
 def _jax_cache_read_only() -> Iterator[list[str]]:
-    """Keep JAX from writing to its own cache; the list receives an entry for each program found there."""
+    """Keep JAX from writing to its own cache; the list receives an entry for each program found
+    there.
+    """
     hits: list[str] = []
 
     def listen(event: str, **_: Any) -> None:

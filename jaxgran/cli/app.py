@@ -1,4 +1,6 @@
-"""Command line: ``jaxgran map``, ``merge``, ``plot``, ``run`` and the others. Exit statuses: ``terminal``."""
+"""Command line: ``jaxgran map``, ``merge``, ``plot``, ``run`` and the others. Exit statuses:
+``terminal``.
+"""
 
 import gc
 import inspect
@@ -8,9 +10,11 @@ from typing import Annotated, NoReturn
 
 import typer
 
-# XLA logs a long error if a cached program was compiled with tuning hints. The variable must be set before JAX loads.
+# XLA logs a long error if a cached program was compiled with tuning hints. The variable must be set
+# before JAX loads.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-# Matrices here are small: threads of OpenBLAS, which NumPy loads, wait for each other longer than they calculate.
+# Matrices here are small: threads of OpenBLAS, which NumPy loads, wait for each other longer than
+# they calculate.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jaxgran
@@ -19,7 +23,14 @@ from jaxgran.cli.explore import EXPLORE_EXAMPLES, explore_command
 from jaxgran.cli.info import INFO_EXAMPLES, info_command
 from jaxgran.cli.map import MAP_EXAMPLES, PLOT_EXAMPLES, map_command, plot_command
 from jaxgran.cli.merge import MERGE_EXAMPLES, merge_command
-from jaxgran.cli.mistakes import Command, Group, UsageError, sentence_of, usage_sentence, with_options
+from jaxgran.cli.mistakes import (
+    Command,
+    Group,
+    UsageError,
+    sentence_of,
+    usage_sentence,
+    with_options,
+)
 from jaxgran.cli.run import RUN_EXAMPLES, run_command
 from jaxgran.cli.tables import use_plain_letters
 from jaxgran.cli.terminal import (
@@ -37,23 +48,35 @@ from jaxgran.model.checks import InputError, short_repr
 
 EXAMPLES = {
     "Where binary collisions dominate, and where they do not": "jaxgran map",
-    "One flow, with a movie of it": "jaxgran run --restitution 0.1 --packing-fraction 0.8 --movie flow.gif",
+    "One flow, with a movie of it": "jaxgran run --restitution 0.1 --packing-fraction 0.8 --movie "
+    "flow.gif",
     "The options of a command": "jaxgran run --help",
 }
 COMMANDS = {  # with their help here, as python -OO leaves docstrings out
     "map": (
         map_command,
         "Map the force ratio over a plane of flows.",
-        "Map the force ratio over restitution and packing fraction, with error bars, and draw its figures.",
+        (
+            "Map the force ratio over restitution and packing fraction, with error bars, and draw "
+            "its figures."
+        ),
         MAP_EXAMPLES,
     ),
     "merge": (
         merge_command,
         "Merge the parts of a map, or maps of other seeds.",
-        "Merge the files of the parts of a map, or of maps of the same settings and other seeds, into one.",
+        (
+            "Merge the files of the parts of a map, or of maps of the same settings and other "
+            "seeds, into one."
+        ),
         MERGE_EXAMPLES,
     ),
-    "plot": (plot_command, "Draw the figures of a map again.", "Draw the figures of a finished map.", PLOT_EXAMPLES),
+    "plot": (
+        plot_command,
+        "Draw the figures of a map again.",
+        "Draw the figures of a finished map.",
+        PLOT_EXAMPLES,
+    ),
     "explore": (
         explore_command,
         "Write a page to look into a map.",
@@ -69,7 +92,10 @@ COMMANDS = {  # with their help here, as python -OO leaves docstrings out
     "where": (
         where_command,
         "Say whether kinetic theory holds for a flow.",
-        "Say what kinetic theory can predict at a restitution and a packing fraction, from a map measured once.",
+        (
+            "Say what kinetic theory can predict at a restitution and a packing fraction, from a "
+            "map measured once."
+        ),
         WHERE_EXAMPLES,
     ),
     "info": (
@@ -89,7 +115,9 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 for name, (command, short_help, long_help, command_examples) in COMMANDS.items():
-    app.command(name, cls=Command, help=long_help, short_help=short_help, epilog=examples(command_examples))(command)
+    app.command(
+        name, cls=Command, help=long_help, short_help=short_help, epilog=examples(command_examples)
+    )(command)
 
 
 def _print_version(wanted: bool) -> None:
@@ -101,16 +129,23 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def command_line(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version and exit."
+        ),
     ] = False,
 ) -> None:
     """Options before the command."""
 
 
 def program() -> None:
-    """The program ``jaxgran``: the command in a process of its own, which does not wait for threads that compile."""
+    """The program ``jaxgran``: the command in a process of its own, which does not wait for threads
+    that compile.
+    """
     outlive_readers()
-    gc.set_threshold(50_000, 20, 100)  # raise the garbage collector's thresholds: the process is short-lived
+    gc.set_threshold(
+        50_000, 20, 100
+    )  # raise the garbage collector's thresholds: the process is short-lived
     try:
         main()
     except SystemExit as end:
@@ -119,7 +154,9 @@ def program() -> None:
 
 
 def main() -> None:
-    """Run the command that is given; a mistake in the input ends with one sentence and exit status 2."""
+    """Run the command that is given; a mistake in the input ends with one sentence and exit status
+    2.
+    """
     use_plain_letters()
     with sigterm_interrupts():
         _run()
@@ -139,7 +176,9 @@ def _run() -> NoReturn:
     except typer.Abort:
         status = INTERRUPTED
     except OSError as error:
-        notes = "".join(f"; {with_options(note, _parameters())}" for note in getattr(error, "__notes__", []))
+        notes = "".join(
+            f"; {with_options(note, _parameters())}" for note in getattr(error, "__notes__", [])
+        )
         file = "" if error.filename is None else f": {short_repr(str(error.filename))}"
         stop(f"stopped by the file system, {error.strerror or error}{file}{notes}.", NO_FILE)
     except Exception as error:

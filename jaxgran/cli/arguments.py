@@ -1,6 +1,7 @@
 """The options of a command, from its table: their help texts, and their values from text.
 
-Typer sees texts, flags and paths only. Numbers, lists and choices are read here, so every mistake is an ``InputError``.
+Typer sees texts, flags and paths only. Numbers, lists and choices are read here, so every mistake
+is an ``InputError``.
 """
 
 import inspect
@@ -31,7 +32,9 @@ def of_map(command: Command) -> dict[str, Option]:
 
 def _as_offered(name: str, one: Option, command: Command) -> Option:
     single = {"several": False} if command == "run" else {}
-    words = one.help + (" A list adds a dimension." if command == "map" and is_new_dimension(name) else "")
+    words = one.help + (
+        " A list adds a dimension." if command == "map" and is_new_dimension(name) else ""
+    )
     text = one.default
     if command == "run" and name in ("restitution", "packing_fraction"):
         text = None
@@ -49,7 +52,8 @@ def command(
     argument: Option | None = None,
     several: bool = False,
 ) -> Callable[..., None]:
-    """A command function for Typer that calls ``run`` with the values of the options that were given.
+    """A command function for Typer that calls ``run`` with the values of the options that were
+    given.
 
     Args:
       table: the options by name.
@@ -69,18 +73,24 @@ def command(
     if argument is not None:
         words = argument.help + (f" [default: {argument.default}]" if argument.default else "")
         first, kind = (None, kind | None) if argument.default else (..., kind)
-        parameters = [_parameter(place, kind, typer.Argument(help=words, show_default=False), first)]
+        parameters = [
+            _parameter(place, kind, typer.Argument(help=words, show_default=False), first)
+        ]
     for name, one in table.items():
         kind = one.kind if one.kind in (bool, Path) else str
         first = ... if name in required else None
-        parameters.append(_parameter(name, kind if first is ... else kind | None, _declared(name, one), first))
+        parameters.append(
+            _parameter(name, kind if first is ... else kind | None, _declared(name, one), first)
+        )
     parsed.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return parsed
 
 
 def _parameter(name: str, kind: Any, declared: Any, first: Any) -> inspect.Parameter:
     first = inspect.Parameter.empty if first is ... else first
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=first, annotation=Annotated[kind, declared])
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=first, annotation=Annotated[kind, declared]
+    )
 
 
 def _declared(name: str, one: Option) -> Any:
@@ -93,7 +103,9 @@ def _declared(name: str, one: Option) -> Any:
     choices = one.kind if isinstance(one.kind, tuple) else ("auto",) if one.auto else ()
     completion = (lambda: list(choices)) if choices else None
     metavar = None if one.kind is bool else placeholder(one)
-    return typer.Option(*names, help=words, metavar=metavar, show_default=False, autocompletion=completion)
+    return typer.Option(
+        *names, help=words, metavar=metavar, show_default=False, autocompletion=completion
+    )
 
 
 def placeholder(one: Option) -> str:
@@ -150,10 +162,14 @@ def _numbers(text: str) -> tuple[float, ...]:
     steps = int(count) - 1
     if not 1 <= steps < MAX_REPLICAS:
         raise ValueError(count)
-    return tuple(round(float(start) + (float(stop) - float(start)) * k / steps, 12) for k in range(steps + 1))
+    return tuple(
+        round(float(start) + (float(stop) - float(start)) * k / steps, 12) for k in range(steps + 1)
+    )
 
 
 def examples(commands: Mapping[str, str]) -> str:
     """The end of a help text: example commands and what they do."""
-    lines = [line for purpose, line in commands.items() for line in (f"  {purpose}:", f"    {line}")]
+    lines = [
+        line for purpose, line in commands.items() for line in (f"  {purpose}:", f"    {line}")
+    ]
     return "\b\n" + "\n".join(["Examples:", *lines])

@@ -27,7 +27,9 @@ EXPLORE_OPTIONS = {
 }
 
 
-def run_explore_command(file: Path | None, output: Path | None = None, overwrite: bool = False) -> None:
+def run_explore_command(
+    file: Path | None, output: Path | None = None, overwrite: bool = False
+) -> None:
     from jaxgran.io.atomic import require_place
     from jaxgran.maps.results import open_map
     from jaxgran.page.document import require_plotly

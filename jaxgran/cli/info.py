@@ -17,10 +17,29 @@ _MEANINGS = {
     "solver": "solver of that engine",
     "cores": "cores of the machine, and of this process",
     "settings": "environment variables that change runs",
-    **{name: f"cache, {name}" for name in ("cache folder", "compiled programs", "numba engine", "figures")},
+    **{
+        name: f"cache, {name}"
+        for name in ("cache folder", "compiled programs", "numba engine", "figures")
+    },
 }
-_PACKAGES = ("jax", "jaxlib", "jax-md", "numba", "numpy", "scipy", "xarray", "netCDF4", "gsd", "matplotlib")
-_SETTINGS = ("JAX_", "XLA_", "OMP_", "CUDA_VISIBLE_DEVICES")  # first letters of environment variables that change runs
+_PACKAGES = (
+    "jax",
+    "jaxlib",
+    "jax-md",
+    "numba",
+    "numpy",
+    "scipy",
+    "xarray",
+    "netCDF4",
+    "gsd",
+    "matplotlib",
+)
+_SETTINGS = (
+    "JAX_",
+    "XLA_",
+    "OMP_",
+    "CUDA_VISIBLE_DEVICES",
+)  # first letters of environment variables that change runs
 
 
 def run_info_command(json: bool = False) -> None:
@@ -36,11 +55,16 @@ def run_info_command(json: bool = False) -> None:
         **_devices(),
         "precision": environment.precision(),
         "ffmpeg": shutil.which("ffmpeg") or "none",
-        "settings": ", ".join(f"{k}={v}" for k, v in sorted(os.environ.items()) if k.startswith(_SETTINGS)) or "none",
+        "settings": ", ".join(
+            f"{k}={v}" for k, v in sorted(os.environ.items()) if k.startswith(_SETTINGS)
+        )
+        or "none",
         **_caches(),
     }
     if json:
-        entries = {name: Entry(value, _MEANINGS.get(name, name), None) for name, value in lines.items()}
+        entries = {
+            name: Entry(value, _MEANINGS.get(name, name), None) for name, value in lines.items()
+        }
         print_json({name.replace(" ", "_"): entry for name, entry in entries.items()})
         return
     for name, value in lines.items():
@@ -82,7 +106,10 @@ def _caches() -> dict[str, str]:
         "numba engine": object_file().parent,
         "figures": Path(matplotlib.get_cachedir()),
     }
-    return {name: "none" if folder is None else f"{folder}, {_state(folder)}" for name, folder in folders.items()}
+    return {
+        name: "none" if folder is None else f"{folder}, {_state(folder)}"
+        for name, folder in folders.items()
+    }
 
 
 def _state(folder: Path) -> str:

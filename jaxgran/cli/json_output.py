@@ -1,4 +1,5 @@
-"""What a command prints with ``--json``: one object, in which each name has its value, error, unit and meaning.
+"""What a command prints with ``--json``: one object, in which each name has its value, error, unit
+and meaning.
 
 =======  ===========================================================================================
 key      content
@@ -18,7 +19,9 @@ import numpy as np
 
 from jaxgran.maps.parameters import Option
 
-JSON = Option("Print one JSON object in place of tables: value, stderr, unit and meaning by name.", bool)
+JSON = Option(
+    "Print one JSON object in place of tables: value, stderr, unit and meaning by name.", bool
+)
 
 
 class Entry(NamedTuple):
@@ -33,7 +36,9 @@ class Entry(NamedTuple):
 def print_json(entries: Mapping[str, Entry]) -> None:
     """Print the entries on standard output."""
     keys = ("value", "stderr", "unit", "meaning")
-    found = {name: {key: _plain(getattr(entry, key)) for key in keys} for name, entry in entries.items()}
+    found = {
+        name: {key: _plain(getattr(entry, key)) for key in keys} for name, entry in entries.items()
+    }
     print(json.dumps(found, indent=2, allow_nan=False))
 
 

@@ -1,4 +1,6 @@
-"""The commands ``map`` and ``plot``: a plane of restitutions and packing fractions, and its figures."""
+"""The commands ``map`` and ``plot``: a plane of restitutions and packing fractions, and its
+figures.
+"""
 
 import math
 import os
@@ -16,15 +18,18 @@ from jaxgran.model.choices import FileFormat
 from jaxgran.model.display import with_error
 
 MAP_EXAMPLES = {
-    "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two cores": "jaxgran map",
+    "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two "
+    "cores": "jaxgran map",
     "Another plane, at the automatic time step": "jaxgran map --restitution 0.1,0.5,0.9 "
     "--packing-fraction 0.5:0.8:4 --timestep auto --output ratio.nc",
-    "Until relative errors are below 10 %, and again after an interruption": "jaxgran map --error 0.1 --resume",
+    "Until relative errors are below 10 %, and again after an interruption": "jaxgran map --error "
+    "0.1 --resume",
 }
 PLOT_EXAMPLES = {
     "The figures of a map, in its folder": "jaxgran plot jaxgran_map.nc",
     "In another folder": "jaxgran plot ratio.nc --output figures",
-    "Without captions, for a manuscript": "jaxgran plot ratio.nc --output figures --format pdf --no-caption",
+    "Without captions, for a manuscript": "jaxgran plot ratio.nc --output figures --format pdf "
+    "--no-caption",
 }
 
 
@@ -35,23 +40,35 @@ MAP_OPTIONS = {
 }
 PLOT_OPTIONS = {
     "output": Option(
-        "Folder of the figures, made if missing.", Path, default="that of the dataset", short="o", example="FOLDER"
+        "Folder of the figures, made if missing.",
+        Path,
+        default="that of the dataset",
+        short="o",
+        example="FOLDER",
     ),
     "format": Option("Format of the figures.", get_args(FileFormat), default="png"),
     "dpi": Option("Dots per inch of a PNG, 50 to 1200.", int, default="200"),
-    "caption": Option("Parameters of the run and notes under the axes.", bool, default="--caption", off=True),
+    "caption": Option(
+        "Parameters of the run and notes under the axes.", bool, default="--caption", off=True
+    ),
 }
 
 
 def run_map_command(format: FileFormat = "png", quiet: bool = False, **given: Any) -> None:
     preset = given.get("preset", "quick")
-    output = given.setdefault("output", Path("jaxgran_map.nc" if preset == "quick" else f"jaxgran_map_{preset}.nc"))
+    output = given.setdefault(
+        "output", Path("jaxgran_map.nc" if preset == "quick" else f"jaxgran_map_{preset}.nc")
+    )
     whole = "part" not in given  # the rest of a map is in other files
     overwrite, existed = given.get("overwrite", False), os.path.exists(output)
     if whole and not overwrite:
         require_new_figures(output, format)
     data, interrupted, written = run_map(given, quiet, "jaxgran.plotting.map_figures")
-    pictures = [] if interrupted else draw_beside(data if whole else None, output, format, overwrite, existed)
+    pictures = (
+        []
+        if interrupted
+        else draw_beside(data if whole else None, output, format, overwrite, existed)
+    )
     if whole:
         print_tables(data)
     finish(data, [*([output] if written else []), *pictures], interrupted, output)
@@ -62,20 +79,26 @@ def require_new_figures(output: Path, format: FileFormat) -> None:
     names = []
     if not os.path.exists(output):
         with suppress(OSError, ValueError):  # a folder that cannot be read is refused later
-            names = [name for name in os.listdir(output.parent) if name.startswith(f"{output.stem}_")]
+            names = [
+                name for name in os.listdir(output.parent) if name.startswith(f"{output.stem}_")
+            ]
     if names:
         from jaxgran.plotting.map_figures import FIGURES
 
         for name in sorted({f"{output.stem}_{figure}.{format}" for figure in FIGURES} & {*names}):
             raise InputError(
-                f"the figure {short_repr(str(output.with_name(name)))} already exists; pass `overwrite=True` to "
+                f"the figure {short_repr(str(output.with_name(name)))} already exists; pass "
+                "`overwrite=True` to "
                 "replace it.",
                 field="output",
             )
 
 
-def draw_beside(data, output: Path, format: FileFormat, overwrite: bool, existed: bool) -> list[Path]:
-    """Draw the figures of a map beside its file, none of a part, then remove those of a map that it replaced.
+def draw_beside(
+    data, output: Path, format: FileFormat, overwrite: bool, existed: bool
+) -> list[Path]:
+    """Draw the figures of a map beside its file, none of a part, then remove those of a map that it
+    replaced.
 
     Files that are there are kept without ``overwrite``. The files drawn.
     """
@@ -103,7 +126,11 @@ def print_tables(data) -> None:
 
 
 def run_plot_command(
-    file: Path, output: Path | None = None, format: FileFormat = "png", dpi: int = 200, caption: bool = True
+    file: Path,
+    output: Path | None = None,
+    format: FileFormat = "png",
+    dpi: int = 200,
+    caption: bool = True,
 ) -> None:
     from jaxgran.maps.results import open_map
     from jaxgran.plotting.map_figures import require_file, save_figures
@@ -127,13 +154,19 @@ def _ratio_table(data, name: str, ratio, stderr) -> Table:
     rule = data.attrs["activation"]
     size = f"{data.attrs['grains']} grains, " if "grains" in data.coords else ""
     title = (
-        f"{name} at {size}dt = {data.attrs['timestep']:g} / shear rate, {rule} activation; a column is a restitution"
+        f"{name} at {size}dt = {data.attrs['timestep']:g} / shear rate, {rule} activation; a "
+        "column is a restitution"
     )
     table = Table(title, ["packing fraction", *(f"{alpha:g}" for alpha in data.restitution.values)])
     for nu in data.packing_fraction.values:
         row = {"packing_fraction": nu}
         marks = ["" if status == 0 else " *" for status in data.status.sel(row).values]
         cells = zip(ratio.sel(row).values, stderr.sel(row).values, strict=True)
-        texts = (with_error(value, error) if math.isfinite(value) else "no value" for value, error in cells)
-        table.rows.append([f"{nu:g}", *(text + mark for text, mark in zip(texts, marks, strict=True))])
+        texts = (
+            with_error(value, error) if math.isfinite(value) else "no value"
+            for value, error in cells
+        )
+        table.rows.append(
+            [f"{nu:g}", *(text + mark for text, mark in zip(texts, marks, strict=True))]
+        )
     return table

@@ -13,12 +13,26 @@ from typing import Any, NamedTuple
 
 from jaxgran.cli.mistakes import with_options
 from jaxgran.cli.tables import Table, print_table
-from jaxgran.cli.terminal import BAD_STATUS, configured_jax, require_device, say, say_written, stop, stop_interrupted
+from jaxgran.cli.terminal import (
+    BAD_STATUS,
+    configured_jax,
+    require_device,
+    say,
+    say_written,
+    stop,
+    stop_interrupted,
+)
 from jaxgran.maps.interruption import Interrupted
 from jaxgran.maps.parameters import options
 from jaxgran.model.checks import refused
 
-_BUDGETED = ("force_ratio", "pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
+_BUDGETED = (
+    "force_ratio",
+    "pressure",
+    "shear_stress",
+    "granular_temperature",
+    "local_granular_temperature",
+)
 
 
 class Outcome(NamedTuple):
@@ -36,7 +50,11 @@ def run_map(parameters: Mapping[str, Any], quiet: bool, load: str = "") -> Outco
     from jaxgran.maps.ratio_map import ratio_map
     from jaxgran.maps.status_report import BadPoints
 
-    given: dict[str, Any] = {"progress": not quiet, "attributes": {"command": command_line()}, **_numerics(parameters)}
+    given: dict[str, Any] = {
+        "progress": not quiet,
+        "attributes": {"command": command_line()},
+        **_numerics(parameters),
+    }
     if load:
         Thread(target=_load, args=(load,), name="jaxgran-load").start()
     output = given.get("output")
@@ -60,8 +78,14 @@ def _numerics(parameters: Mapping[str, Any]) -> dict[str, Any]:
     given = dict(parameters)
     solver = given.get("solver")
     if isinstance(solver, str):
-        if solver not in SOLVERS:  # of a file, which has the name of a user's class and not the class
-            raise refused("solver", solver, f"must be {', '.join(SOLVERS)}, or a class that is passed to ratio_map")
+        if (
+            solver not in SOLVERS
+        ):  # of a file, which has the name of a user's class and not the class
+            raise refused(
+                "solver",
+                solver,
+                f"must be {', '.join(SOLVERS)}, or a class that is passed to ratio_map",
+            )
         given["solver"] = SOLVERS[solver]()
     if isinstance(given.get("engine"), str):
         given["engine"] = engine_named(given["engine"])
@@ -102,20 +126,26 @@ def _say_imprecise(data) -> None:
     strain = data["seeds/strain"].where(data["seeds/strain"] > 0)
     lost = f" of the {known.sum()} points with an error" if not known.all() else ""
     say(
-        f"relative errors: {data.attrs['error']:g} requested, {errors[:, known].max():.2g} at the worst point{lost}; "
+        f"relative errors: {data.attrs['error']:g} requested, {errors[:, known].max():.2g} at the "
+        f"worst point{lost}; "
         f"sampled strains of {float(strain.min()):g} to {float(strain.max()):g} per seed"
     )
 
 
 def print_budget(data) -> None:
-    """Print the parts of the error where any is known: those of each point, or their median and largest over a map."""
+    """Print the parts of the error where any is known: those of each point, or their median and
+    largest over a map.
+    """
     import numpy as np
 
     from jaxgran.maps.schema import relative_ci95
 
     if not np.isfinite(data.force_ratio).any():
         return
-    title = f"Relative error, 95 %, of a large system{'' if data.status.size == 1 else ': median (largest)'}"
+    title = (
+        "Relative error, 95 %, of a large "
+        f"system{'' if data.status.size == 1 else ': median (largest)'}"
+    )
     if "comment" in data.force_ratio_ci95.attrs:
         title += f"\n{data.force_ratio_ci95.attrs['comment']}"
     table = Table(title, ("observable", "sampling", "time step", "size", "tolerance", "total"))
@@ -129,7 +159,9 @@ def print_budget(data) -> None:
 
 
 def _percent(part) -> str:
-    """The median of a part of the error over the points, and the largest one if there are several."""
+    """The median of a part of the error over the points, and the largest one if there are
+    several.
+    """
     import numpy as np
 
     known = part[np.isfinite(part)]
@@ -153,7 +185,9 @@ def finish(data, written: list[Path], interrupted: bool, output: Path | None = N
     if short:
         say(with_options(format_short(data, short), options("map")))
     if interrupted:
-        missing = "" if data.status.size == 1 else f" with {len(bad.get('not_run', []))} points missing"
+        missing = (
+            "" if data.status.size == 1 else f" with {len(bad.get('not_run', []))} points missing"
+        )
         saved = "nothing is saved."
         if output is not None and os.path.isdir(f"{output}.unfinished"):
             resume = "" if "--resume" in data.attrs["command"] else " --resume"

@@ -13,7 +13,8 @@ from jaxgran.model.choices import FileFormat
 
 MERGE_EXAMPLES = {
     "The parts of an array job": "jaxgran merge parts/part-*.nc --output map.nc",
-    "Two maps of the same settings, the second from --first-seed 2 on": "jaxgran merge map.nc more.nc --output both.nc",
+    "Two maps of the same settings, the second from --first-seed 2 on": "jaxgran merge map.nc "
+    "more.nc --output both.nc",
 }
 MERGE_OPTIONS = {
     "output": option("output"),
@@ -22,7 +23,9 @@ MERGE_OPTIONS = {
 }
 
 
-def run_merge_command(files: list[Path], output: Path, overwrite: bool = False, format: FileFormat = "png") -> None:
+def run_merge_command(
+    files: list[Path], output: Path, overwrite: bool = False, format: FileFormat = "png"
+) -> None:
     configured_jax()
     require_device()
     from jaxgran.io.atomic import require_place
@@ -33,7 +36,9 @@ def run_merge_command(files: list[Path], output: Path, overwrite: bool = False, 
     existed = os.path.exists(output)
     if existed and not overwrite:
         raise InputError(
-            f"output {short_repr(str(output))} already exists; pass `overwrite=True` to replace it.", field="output"
+            f"output {short_repr(str(output))} already exists; pass `overwrite=True` to "
+            "replace it.",
+            field="output",
         )
     if not overwrite:
         require_new_figures(output, format)

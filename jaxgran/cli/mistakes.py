@@ -1,4 +1,6 @@
-"""Mistakes on the command line as one sentence: the option, the given value, and what is accepted."""
+"""Mistakes on the command line as one sentence: the option, the given value, and what is
+accepted.
+"""
 
 import re
 import sys
@@ -50,7 +52,10 @@ class Command(typer.core.TyperCommand):
             raise InputError(f"{name} {need}: see {ctx.command_path} --help.") from None
         if extra and not ctx.resilient_parsing:
             given = short_repr(" ".join(extra))
-            raise InputError(f"{given} belongs to no option; values follow their options, and lists have no spaces.")
+            raise InputError(
+                f"{given} belongs to no option; values follow their options, and lists have no "
+                "spaces."
+            )
         return extra
 
 
@@ -72,7 +77,9 @@ def option_name(field: str) -> str:
 
 
 def with_options(text: str, names: Container[str]) -> str:
-    """The text with options in place of parameters in backticks: `overwrite=True` becomes --overwrite."""
+    """The text with options in place of parameters in backticks: `overwrite=True` becomes
+    --overwrite.
+    """
 
     def as_option(match: re.Match) -> str:
         name, value = match.groups()
@@ -87,7 +94,11 @@ def sentence_of(mistake: InputError, names: Container[str]) -> str:
     """The message of an InputError in terms of the options of a command."""
     text = with_options(str(mistake), names)
     first, space, rest = text.partition(" ")  # the field, where it is named at all
-    return option_name(first) + space + rest if first in names and mistake.field in ("", first) else text
+    return (
+        option_name(first) + space + rest
+        if first in names and mistake.field in ("", first)
+        else text
+    )
 
 
 def usage_sentence(mistake: Any) -> str:

@@ -21,13 +21,21 @@ _RECORDED_STRAIN = 5.0  # sampled strain where frames are recorded and none is g
 
 _PHYSICS = (  # what is printed without --all, with the shear-stress ratio below the first
     *("force_ratio", "pressure", "shear_stress", "macroscopic_friction", "inertial_number"),
-    *("granular_temperature", "local_granular_temperature", "coordination_number", "collision_rate"),
+    *(
+        "granular_temperature",
+        "local_granular_temperature",
+        "coordination_number",
+        "collision_rate",
+    ),
 )
 
 RUN_EXAMPLES = {
-    "A flow in its steady state: averages with errors": "jaxgran run --restitution 0.5 --packing-fraction 0.7",
-    "A movie of it, about a hundred frames": "jaxgran run --restitution 0.1 --packing-fraction 0.8 --movie flow.gif",
-    "All its frames for other programs, every 0.01 of strain": "jaxgran run --restitution 0.5 --packing-fraction 0.7 "
+    "A flow in its steady state: averages with errors": "jaxgran run --restitution 0.5 "
+    "--packing-fraction 0.7",
+    "A movie of it, about a hundred frames": "jaxgran run --restitution 0.1 --packing-fraction 0.8 "
+    "--movie flow.gif",
+    "All its frames for other programs, every 0.01 of strain": "jaxgran run --restitution 0.5 "
+    "--packing-fraction 0.7 "
     "--trajectory flow.gsd --frame-strain 0.01",
 }
 
@@ -35,13 +43,16 @@ RUN_EXAMPLES = {
 RUN_OPTIONS = {
     **of_map("run"),
     "trajectory": Option(
-        "GSD file of the flow, frame by frame. Recording frames splits the run at different steps, so averages change "
+        "GSD file of the flow, frame by frame. Recording frames splits the run at different steps, "
+        "so averages change "
         "within their errors.",
         Path,
         example="FILE.gsd",
     ),
     "movie": Option(
-        "GIF or MP4 of the flow: grains by their speed, and the forces between them.", Path, example="FILE.gif"
+        "GIF or MP4 of the flow: grains by their speed, and the forces between them.",
+        Path,
+        example="FILE.gif",
     ),
     "frame_strain": Option(
         "Strain between frames, each at the nearest time step.",
@@ -55,7 +66,9 @@ RUN_OPTIONS = {
     "json": JSON,
     "quiet": QUIET,
 }
-RUN_OPTIONS["strain"] = replace(RUN_OPTIONS["strain"], default=f"{RUN_OPTIONS['strain'].default}; 5 with frames")
+RUN_OPTIONS["strain"] = replace(
+    RUN_OPTIONS["strain"], default=f"{RUN_OPTIONS['strain'].default}; 5 with frames"
+)
 RUN_OPTIONS["seeds"] = replace(RUN_OPTIONS["seeds"], default="1")
 
 
@@ -75,14 +88,18 @@ def run_run_command(
     chosen = {"seeds": 1, **given}
     if frames_wanted:
         if chosen["seeds"] > 1:
-            raise InputError("`trajectory` and `movie` show one seed: leave out `seeds`.", field="seeds")
+            raise InputError(
+                "`trajectory` and `movie` show one seed: leave out `seeds`.", field="seeds"
+            )
         if "error" not in chosen:
             chosen.setdefault("strain", _RECORDED_STRAIN)
     strain = chosen.get("strain", _RECORDED_STRAIN)
     for name, file in (("trajectory", trajectory), ("movie", movie)):
         if file is not None and os.path.isfile(file) and not chosen.get("overwrite"):
             raise InputError(
-                f"{name} {short_repr(str(file))} already exists; pass `overwrite=True` to replace it.", field=name
+                f"{name} {short_repr(str(file))} already exists; pass `overwrite=True` to replace "
+                "it.",
+                field=name,
             )
     recorder, frames = _recorder(trajectory, movie, frame_strain, force_strain, strain)
     record = None if recorder is None else recorder.recording
@@ -95,7 +112,10 @@ def run_run_command(
         print_table(_summary_table(data, all))
         print_budget(data)
     if recorder is not None and recorder.frames:
-        say("recording frames split the run at different steps, so averages change within their errors.")
+        say(
+            "recording frames split the run at different steps, so averages change within their "
+            "errors."
+        )
         if trajectory is not None:
             say(f"wrote {trajectory}: {recorder.frames} frames")
         if movie is not None:
@@ -127,8 +147,13 @@ def _recorder(
     if frame_strain is not None:
         most_frames = MOST_RECORDED if movie is None else MOST_DRAWN
         least, most = strain / most_frames, strain
-        accepted = f"at least {least:g}, for {most_frames} frames, and at most the sampled strain, {most:g}"
-        require_number("frame_strain", frame_strain, lambda x: (x >= 0.99 * least) & (x <= most), accepted)
+        accepted = (
+            f"at least {least:g}, for {most_frames} frames, and at most the sampled strain, "
+            f"{most:g}"
+        )
+        require_number(
+            "frame_strain", frame_strain, lambda x: (x >= 0.99 * least) & (x <= most), accepted
+        )
     every = strain / 100 if frame_strain is None else frame_strain
     if force_strain is not None:
         accepted = f"above 0 and at most the strain between frames, {every:g}"
@@ -154,13 +179,18 @@ def _write_movie(movie: Path, frames, quiet: bool) -> None:
 
 
 def _entries(data) -> dict[str, Entry]:
-    """The parameters of one flow, its averages, its shear-stress ratio, and what kinetic theory predicts."""
+    """The parameters of one flow, its averages, its shear-stress ratio, and what kinetic theory
+    predicts.
+    """
     from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
     from jaxgran.maps.status_report import bad_points
     from jaxgran.sampling.observables import OBSERVABLES
 
     point = flattened(data).isel(packing_fraction=0, restitution=0)
-    entries = {name: Entry(point[name].values, point[name].long_name) for name in ("restitution", "packing_fraction")}
+    entries = {
+        name: Entry(point[name].values, point[name].long_name)
+        for name in ("restitution", "packing_fraction")
+    }
     entries |= {
         "grains": Entry(data.attrs["grains"], "number of grains"),
         "timestep": Entry(data.attrs["timestep"], "time step", "1 / shear rate"),
@@ -188,7 +218,9 @@ def _entries(data) -> dict[str, Entry]:
 
 
 def _summary_table(data, all: bool) -> Table:
-    """The averages of one flow with errors, units, effective sample sizes and predictions of kinetic theory."""
+    """The averages of one flow with errors, units, effective sample sizes and predictions of
+    kinetic theory.
+    """
     from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
     from jaxgran.maps.theory_variables import LENGTHS
     from jaxgran.sampling.observables import GROUPS, OBSERVABLES
@@ -198,7 +230,13 @@ def _summary_table(data, all: bool) -> Table:
         f"{grains} grains, dt = {timestep:g} / shear rate, {rule} activation\n"
         f"engine {data.attrs['engine']}, solver {data.attrs['solver']}"
     )
-    columns = ("observable", "value ± standard error", "unit", "effective samples", "kinetic theory")
+    columns = (
+        "observable",
+        "value ± standard error",
+        "unit",
+        "effective samples",
+        "kinetic theory",
+    )
     table = Table(title, columns, numbers=False)
     point = flattened(data).isel(packing_fraction=0, restitution=0)
     strain = float(point["seeds/strain"].sum())
@@ -217,12 +255,16 @@ def _summary_table(data, all: bool) -> Table:
             samples = strain / correlated.get(name, math.nan)
             theory = number(f"theory/{name}")
             texts = ["" if math.isnan(x) else f"{x:.3g}" for x in (samples, theory)]
-            table.rows.append([name.replace("_", " "), value, unit_text(OBSERVABLES[name].unit), *texts])
+            table.rows.append(
+                [name.replace("_", " "), value, unit_text(OBSERVABLES[name].unit), *texts]
+            )
             if name == "force_ratio":
                 ratio = with_error(*map(float, shear_stress_ratio(point)))
                 table.rows.append(["shear-stress ratio", ratio, "", "", ""])
             if name == "binary_dissipation_rate":
                 for length in (f"theory/{one}" for one in LENGTHS):
                     value = with_error(number(length), number(f"{length}_stderr"))
-                    table.rows.append([length[7:].replace("_", " "), value, unit_text("sigma"), "", ""])
+                    table.rows.append(
+                        [length[7:].replace("_", " "), value, unit_text("sigma"), "", ""]
+                    )
     return table

@@ -1,4 +1,6 @@
-"""Tables on standard output: split into pages on a narrow terminal, and in ASCII where its encoding needs it."""
+"""Tables on standard output: split into pages on a narrow terminal, and in ASCII where its encoding
+needs it.
+"""
 
 import codecs
 import os
@@ -22,10 +24,11 @@ _IN_ASCII = str.maketrans(
 
 @dataclass
 class Table:
-    """A table of strings: title, column names and rows; a row of a single string is a group heading.
+    """A table of strings: title, column names and rows; a row of a single string is a group
+    heading.
 
-    The first column names a row and is repeated on every page. The others are right-aligned, or left-aligned if
-    ``numbers`` is False.
+    The first column names a row and is repeated on every page. The others are right-aligned, or
+    left-aligned if ``numbers`` is False.
     """
 
     title: str
@@ -35,7 +38,9 @@ class Table:
 
 
 def print_table(table: Table) -> None:
-    """Print a table on standard output; columns that do not fit its width follow on further pages."""
+    """Print a table on standard output; columns that do not fit its width follow on further
+    pages.
+    """
     console = Console()
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console = Console(width=_UNLIMITED)
@@ -86,7 +91,9 @@ def use_plain_letters() -> None:
 
 
 def _in_ascii(error: UnicodeError) -> tuple[str | bytes, int]:
-    """Replacement of characters that cannot be encoded; undecodable bytes of a file name are kept."""
+    """Replacement of characters that cannot be encoded; undecodable bytes of a file name are
+    kept.
+    """
     if not isinstance(error, UnicodeEncodeError):
         raise error
     letters = error.object[error.start : error.end]

@@ -57,7 +57,9 @@ def require_device() -> None:
 
 @cache
 def _say_cache() -> None:
-    """Print once if the cache is not in the user's folder; Matplotlib's cache then goes to the same place."""
+    """Print once if the cache is not in the user's folder; Matplotlib's cache then goes to the same
+    place.
+    """
     if not fallback_message():
         return
     say(fallback_message())
@@ -80,7 +82,9 @@ def outlive_readers() -> None:
 
 
 class _Outliving(FileIO):
-    """A pipe or a file that discards output once its reader has gone, or once it has failed with an OSError."""
+    """A pipe or a file that discards output once its reader has gone, or once it has failed with an
+    OSError.
+    """
 
     _failed = False
 
@@ -134,7 +138,9 @@ def sigterm_interrupts() -> Iterator[None]:
 
 
 def end_without_threads(status: int) -> None:
-    """End the process if a thread of this package still computes or compiles, which Python would wait for."""
+    """End the process if a thread of this package still computes or compiles, which Python would
+    wait for.
+    """
     if any(thread.name.startswith("jaxgran-") for thread in threading.enumerate()):
         sys.stdout.flush()
         sys.stderr.flush()

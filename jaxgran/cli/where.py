@@ -9,7 +9,8 @@ from jaxgran.reference.table import FACTORS, MEASURED, THEORIES, shipped_table
 from jaxgran.reference.validity import COLUMNS, Validity, validity
 
 WHERE_EXAMPLES = {
-    "Does kinetic theory hold at a restitution and a packing fraction": "jaxgran where --restitution 0.7 "
+    "Does kinetic theory hold at a restitution and a packing fraction": "jaxgran where "
+    "--restitution 0.7 "
     "--packing-fraction 0.6",
     "The same for a program": "jaxgran where --restitution 0.7 --packing-fraction 0.6 --json",
 }
@@ -38,13 +39,20 @@ def run_where_command(restitution: float, packing_fraction: float, json: bool = 
     about = f"α = {restitution:g}, ν = {packing_fraction:g}; ± 95 %; units of m, σ and 1/γ̇"
     averages = Table(about, COLUMNS, found.rows())
     print_table(averages)
-    assumed = "Enskog's contact pressure at the measured granular temperature, one assumption after the other"
+    assumed = (
+        "Enskog's contact pressure at the measured granular temperature, one assumption "
+        "after the other"
+    )
     factors = Table(assumed, ("assumed", "factor if measured instead"))
     for name in FACTORS:
         factor = with_error(float(found.factors[name]), float(found.factors_ci95[name]))
         factors.rows.append([_ASSUMPTIONS[name], factor])
     print_table(factors)
-    print(plain(f"Reference map: {table.made_with}. Kinetic theory: {THEORIES[table.head['theory']]}."))
+    print(
+        plain(
+            f"Reference map: {table.made_with}. Kinetic theory: {THEORIES[table.head['theory']]}."
+        )
+    )
 
 
 def _entries(found: Validity) -> dict[str, Entry]:
@@ -66,16 +74,26 @@ def _entries(found: Validity) -> dict[str, Entry]:
         entries[f"error/{name}"] = Entry(value, "kinetic theory over measured average, less one")
         entries[f"error/{name}_ci95"] = Entry(found.error_ci95[name], half)
     for name, value in found.corrected.items():
-        entries[f"corrected/{name}"] = Entry(value, "prediction of the corrected theory", _UNITS[name])
+        entries[f"corrected/{name}"] = Entry(
+            value, "prediction of the corrected theory", _UNITS[name]
+        )
     for name, value in found.corrected_error.items():
-        entries[f"corrected_error/{name}"] = Entry(value, "corrected theory over measured average, less one")
+        entries[f"corrected_error/{name}"] = Entry(
+            value, "corrected theory over measured average, less one"
+        )
         entries[f"corrected_error/{name}_ci95"] = Entry(found.corrected_error_ci95[name], half)
     for name, value in found.factors.items():
-        entries[f"factor/{name}"] = Entry(value, f"contact pressure as measured, over that if {_ASSUMPTIONS[name]}")
+        entries[f"factor/{name}"] = Entry(
+            value, f"contact pressure as measured, over that if {_ASSUMPTIONS[name]}"
+        )
         entries[f"factor/{name}_ci95"] = Entry(found.factors_ci95[name], half)
     grains = head["grains"]  # a number, or in words where it depends on the flow
-    entries["grains"] = Entry(int(grains) if grains.isdecimal() else grains, "number of grains of the reference map")
-    entries["timestep"] = Entry(float(head["timestep"]), "time step of the reference map", "1 / shear rate")
+    entries["grains"] = Entry(
+        int(grains) if grains.isdecimal() else grains, "number of grains of the reference map"
+    )
+    entries["timestep"] = Entry(
+        float(head["timestep"]), "time step of the reference map", "1 / shear rate"
+    )
     return entries
 
 

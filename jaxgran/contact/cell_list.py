@@ -1,12 +1,15 @@
-"""Search for near pairs in the sheared cell, linear in the number of grains; the only module that imports jax-md.
+"""Search for near pairs in the sheared cell, linear in the number of grains; the only module that
+imports jax-md.
 
-The grains are sorted into a grid of cells by ``jax_md.partition.cell_list``, in the fractional coordinates that move
-with the sheared cell, s = ((x − tilt·y)/L, y/L). A disc of radius r covers ±√(1 + tilt²) r/L of s_x and ±r/L of s_y,
-so with square cells of the larger size, at the largest tilt ½, all its neighbours lie in 3×3 cells. Each grain is
-compared with those in half of them. The pairs found are gathered through words of 32 bits, one bit for each candidate.
+The grains are sorted into a grid of cells by ``jax_md.partition.cell_list``, in the fractional
+coordinates that move with the sheared cell, s = ((x − tilt·y)/L, y/L). A disc of radius r covers
+±√(1 + tilt²) r/L of s_x and ±r/L of s_y, so with square cells of the larger size, at the largest
+tilt ½, all its neighbours lie in 3×3 cells. Each grain is compared with those in half of them. The
+pairs found are gathered through words of 32 bits, one bit for each candidate.
 
-jax-md's ``neighbor_list`` finds the same pairs but writes every candidate to its place. It takes three times as long
-as this search for a thousand grains, and over ten times as long for ten thousand.
+jax-md's ``neighbor_list`` finds the same pairs but writes every candidate to its place. It takes
+three times as long as this search for a thousand grains, and over ten times as long for ten
+thousand.
 """
 
 import math
@@ -21,11 +24,16 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxgran.model.control_flow import any_replica, where_active
 
 _WORD = 32
-_CELL_CAPACITIES = (_WORD, 4 * _WORD)  # about 10 grains are expected in a cell; the second for dense clusters
+_CELL_CAPACITIES = (
+    _WORD,
+    4 * _WORD,
+)  # about 10 grains are expected in a cell; the second for dense clusters
 _MARGIN = 1.2  # of the number of pairs that the grid is made for, over the capacity
 _ROOM = 2  # candidates returned, over the capacity
 _LARGEST_TILT = 0.5
-_HALF_STENCIL = np.array([[0, 0], [1, 0], [-1, 1], [0, 1], [1, 1]], np.int32)  # the cell itself comes first
+_HALF_STENCIL = np.array(
+    [[0, 0], [1, 0], [-1, 1], [0, 1], [1, 1]], np.int32
+)  # the cell itself comes first
 
 
 def cell_list_pairs(
@@ -33,8 +41,9 @@ def cell_list_pairs(
 ) -> tuple[Int[Array, " pairs"], Int[Array, " pairs"], Bool[Array, ""]]:
     """All pairs of grains whose centres are within a cutoff, each once.
 
-    The grid is static: it serves a cutoff within which a homogeneous flow has up to 1.2 × ``capacity`` pairs, and any
-    smaller one. Up to 2 × ``capacity`` pairs are found, with up to 128 grains in a cell; beyond that ``missed`` is set.
+    The grid is static: it serves a cutoff within which a homogeneous flow has up to 1.2 ×
+      ``capacity`` pairs, and any smaller one. Up to 2 × ``capacity`` pairs are found, with up to
+      128 grains in a cell; beyond that ``missed`` is set.
 
     Args:
       positions: (grains, 2), centres in σ.
@@ -43,12 +52,16 @@ def cell_list_pairs(
       capacity: number of pairs to expect at most in a homogeneous flow; static.
 
     Returns:
-      Grains i < j of each pair (2·capacity,), with i = j in an empty slot; and whether pairs may be missing, since the
-      cutoff is too large for the grid, or a cell or the list of pairs is full.
+      Grains i < j of each pair (2·capacity,), with i = j in an empty slot; and whether pairs may be
+      missing, since the cutoff is too large for the grid, or a cell or the list of pairs is full.
     """
-    positions, side, tilt, cutoff = lax.stop_gradient((positions, side, tilt, cutoff))  # pairs are whole numbers
+    positions, side, tilt, cutoff = lax.stop_gradient(
+        (positions, side, tilt, cutoff)
+    )  # pairs are whole numbers
     cells = _cells_per_side(positions.shape[0], capacity)
-    fractional = jnp.stack([positions[:, 0] - tilt * positions[:, 1], positions[:, 1]], axis=-1) / side
+    fractional = (
+        jnp.stack([positions[:, 0] - tilt * positions[:, 1], positions[:, 1]], axis=-1) / side
+    )
     fractional = fractional - jnp.floor(fractional)
     reach = cutoff / side + 8 * jnp.finfo(positions.dtype).eps  # the coordinates are rounded
     cells_suffice = reach * jnp.sqrt(1 + tilt**2) <= 1 / cells
@@ -59,7 +72,9 @@ def cell_list_pairs(
     few = search(_CELL_CAPACITIES[0])
     crowded = few[-1]
     i, j, overfull, crowded = lax.cond(
-        any_replica(crowded), lambda: where_active(crowded, search(_CELL_CAPACITIES[1]), few), lambda: few
+        any_replica(crowded),
+        lambda: where_active(crowded, search(_CELL_CAPACITIES[1]), few),
+        lambda: few,
     )
     return i, j, overfull | crowded | ~cells_suffice
 
@@ -71,13 +86,19 @@ def largest_cutoff(count: int, side: Array, capacity: int) -> Float[Array, ""]:
 
 
 def _cells_per_side(count: int, capacity: int) -> int:
-    """As many cells along each side as the cutoff allows, but at least 3 and on average a grain or more in each."""
+    """As many cells along each side as the cutoff allows, but at least 3 and on average a grain or
+    more in each.
+    """
     reach = math.sqrt(2 * _MARGIN * capacity / (math.pi * count**2))  # cutoff/L
     return max(3, min(int(1 / (reach * math.hypot(1, _LARGEST_TILT))), math.isqrt(count)))
 
 
-def _search(fractional: Array, tilt: Array, reach: Array, cells_per_side: int, cell_capacity: int, size: int):
-    """Pairs (i, j), whether there are more than ``size``, and whether a cell holds more than its capacity."""
+def _search(
+    fractional: Array, tilt: Array, reach: Array, cells_per_side: int, cell_capacity: int, size: int
+):
+    """Pairs (i, j), whether there are more than ``size``, and whether a cell holds more than its
+    capacity.
+    """
     count, words = fractional.shape[0], cell_capacity // _WORD
     cells = _cell_list(fractional, cells_per_side, cell_capacity)
     members = cells.id_buffer.reshape(-1, words, _WORD)
@@ -92,14 +113,18 @@ def _search(fractional: Array, tilt: Array, reach: Array, cells_per_side: int, c
     other = members[near]  # (grains, stencil, words, 32)
     once = (other > grain) | (np.arange(len(_HALF_STENCIL)) > 0)[None, :, None, None]
     pair = ((dx + tilt * dy) ** 2 + dy**2 <= reach**2) & (other < count) & once
-    bits = jnp.where(pair, jnp.uint32(1) << np.arange(_WORD, dtype=np.uint32)[None, None, None], jnp.uint32(0))
+    bits = jnp.where(
+        pair, jnp.uint32(1) << np.arange(_WORD, dtype=np.uint32)[None, None, None], jnp.uint32(0)
+    )
     bits = jnp.sum(bits, axis=-1, dtype=jnp.uint32).reshape(-1)
 
     counts = lax.population_count(bits).astype(jnp.int32)
     ends = jnp.cumsum(counts, dtype=jnp.int32)
     starts = ends - counts
     index = jnp.arange(bits.size, dtype=jnp.int32)
-    word = lax.cummax(jnp.zeros(size, jnp.int32).at[starts].max(index, mode="drop"))  # the word of each pair
+    word = lax.cummax(
+        jnp.zeros(size, jnp.int32).at[starts].max(index, mode="drop")
+    )  # the word of each pair
     slot = jnp.arange(size, dtype=jnp.int32)
     place = set_bit(bits[word], slot - starts[word])
     i = word // (len(_HALF_STENCIL) * words)
@@ -110,7 +135,9 @@ def _search(fractional: Array, tilt: Array, reach: Array, cells_per_side: int, c
 
 
 def set_bit(bits: Array, rank: Array) -> Array:
-    """Place of the set bit of the given rank (from 0) in words of 32 bits: that of the first with more set bits."""
+    """Place of the set bit of the given rank (from 0) in words of 32 bits: that of the first with
+    more set bits.
+    """
     up_to = np.uint32(2) * (np.uint32(1) << np.arange(_WORD, dtype=np.uint32)) - np.uint32(1)
     set_up_to = lax.population_count(bits[:, None] & up_to[None, :]).astype(rank.dtype)
     return jnp.sum(set_up_to <= rank[:, None], axis=1, dtype=rank.dtype)
@@ -119,7 +146,8 @@ def set_bit(bits: Array, rank: Array) -> Array:
 def _cell_list(fractional: Array, cells_per_side: int, cell_capacity: int):
     """jax-md's cell list of points in the unit square.
 
-    Importing jax-md takes seconds and computes constants: it is imported when first needed, and outside the trace.
+    Importing jax-md takes seconds and computes constants: it is imported when first needed, and
+    outside the trace.
     """
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         with jax.ensure_compile_time_eval(), warnings.catch_warnings():

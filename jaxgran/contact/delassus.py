@@ -1,17 +1,20 @@
-"""The Delassus operator W = H M⁻¹ Hᵀ of a contact network: its products, and diagonals to scale an iteration by.
+"""The Delassus operator W = H M⁻¹ Hᵀ of a contact network: its products, and diagonals to scale an
+iteration by.
 
-W of a network is never stored: Hᵀ gathers the impulses of the contacts on their grains, H reads the relative normal
-velocities that follow. Two diagonals D stand for it in the ``projected_methods``:
+W of a network is never stored: Hᵀ gathers the impulses of the contacts on their grains, H reads the
+  relative normal velocities that follow. Two diagonals D stand for it in the ``projected_methods``:
 
-- ``diagonal``: W_cc = 1/m_i + 1/m_j. The classical choice; nothing bounds W by it, and networks make it diverge.
-- ``spectral_bound``: λ(A_i)/m_i + λ(A_j)/m_j with λ(A_b) the largest eigenvalue of A_b = Σ n nᵀ over the contacts of
-  grain b, a 2×2 matrix. For any vector x, xᵀWx = Σ_b |Σ_c ±n x_c|²/m_b ≤ Σ_b λ(A_b)/m_b Σ_{c∋b} x_c² = xᵀDx, so W ⪯ D.
+- ``diagonal``: W_cc = 1/m_i + 1/m_j. The classical choice; nothing bounds W by it, and networks
+  make it diverge.
+- ``spectral_bound``: λ(A_i)/m_i + λ(A_j)/m_j with λ(A_b) the largest eigenvalue of A_b = Σ n nᵀ
+  over the contacts of grain b, a 2×2 matrix. For any vector x, xᵀWx = Σ_b |Σ_c ±n x_c|²/m_b ≤ Σ_b
+  λ(A_b)/m_b Σ_{c∋b} x_c² = xᵀDx, so W ⪯ D.
 
 An isolated pair has D = W in both.
 
-A problem given by its matrix has the same functions. Its bounds know no grains, only the entries of W. For any
-s > 0, 2 |x_c x_d| ≤ x_c² s_d/s_c + x_d² s_c/s_d, so the diagonal Σ_d |W_cd| s_d/s_c bounds W (Gershgorin). With
-s_c = W_cc^-½ it is ``spectral_bound``.
+A problem given by its matrix has the same functions. Its bounds know no grains, only the entries of
+W. For any s > 0, 2 |x_c x_d| ≤ x_c² s_d/s_c + x_d² s_c/s_d, so the diagonal Σ_d |W_cd| s_d/s_c
+bounds W (Gershgorin). With s_c = W_cc^-½ it is ``spectral_bound``.
 """
 
 from collections.abc import Callable
@@ -30,7 +33,9 @@ from jaxgran.model.indexing import added_at, taken
 Operator = Contacts | DelassusProblem  # what has the functions product, diagonal and bound
 
 
-def grain_impulses(contacts: Contacts, impulses: Float[Array, " contacts"], grains: int) -> Float[Array, "grains 2"]:
+def grain_impulses(
+    contacts: Contacts, impulses: Float[Array, " contacts"], grains: int
+) -> Float[Array, "grains 2"]:
     """Total impulse Hᵀp on every grain."""
     along = contacts.normals * impulses[:, None]
     return _gathered(contacts, along, -along, grains)
@@ -39,16 +44,24 @@ def grain_impulses(contacts: Contacts, impulses: Float[Array, " contacts"], grai
 def loads_of_grains(
     contacts: Contacts, impulses: Float[Array, " contacts"], grains: int
 ) -> tuple[Float[Array, "grains 2"], Float[Array, " grains"]]:
-    """Total impulse on every grain, and how many of its contacts have one; one scatter costs less than two."""
-    along, loaded = contacts.normals * impulses[:, None], (impulses > 0).astype(impulses.dtype)[:, None]
-    # a product, not a negation: XLA compiles it to code that takes 0.65 to 0.8 of the time of a step on a processor
+    """Total impulse on every grain, and how many of its contacts have one; one scatter costs less
+    than two.
+    """
+    along, loaded = (
+        contacts.normals * impulses[:, None],
+        (impulses > 0).astype(impulses.dtype)[:, None],
+    )
+    # a product, not a negation: XLA compiles it to code that takes 0.65 to 0.8 of the time of a
+    # step on a processor
     first, second = (jnp.concatenate([sign * along, loaded], axis=1) for sign in (1, -1))
     total = _gathered(contacts, first, second, grains)
     return total[:, :2], total[:, 2]
 
 
 @singledispatch
-def delassus_product(contacts: Contacts, impulses: Float[Array, " contacts"], grains: int) -> Float[Array, " contacts"]:
+def delassus_product(
+    contacts: Contacts, impulses: Float[Array, " contacts"], grains: int
+) -> Float[Array, " contacts"]:
     """Change W p of the relative normal velocities that the impulses cause."""
     total = grain_impulses(contacts, impulses, grains)
     change = taken(total, contacts.i) * contacts.inverse_mass_i[:, None]
@@ -70,7 +83,10 @@ def spectral_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]
     total = _gathered(contacts, outer, outer, grains)
     xx, xy, yy = total[:, 0], total[:, 1], total[:, 2]
     largest = largest_eigenvalue(xx, xy, yy)
-    bound = taken(largest, contacts.i) * contacts.inverse_mass_i + taken(largest, contacts.j) * contacts.inverse_mass_j
+    bound = (
+        taken(largest, contacts.i) * contacts.inverse_mass_i
+        + taken(largest, contacts.j) * contacts.inverse_mass_j
+    )
     return jnp.where(contacts.used, bound, 1)
 
 
@@ -120,9 +136,14 @@ def _each(matrix: Any, function: Callable[[Array], Array]) -> Any:
 
 
 def _gathered(
-    contacts: Contacts, at_i: Float[Array, "contacts k"], at_j: Float[Array, "contacts k"], grains: int
+    contacts: Contacts,
+    at_i: Float[Array, "contacts k"],
+    at_j: Float[Array, "contacts k"],
+    grains: int,
 ) -> Float[Array, "grains k"]:
-    """Sums over the contacts of every grain: one scatter over all ends costs less than one for each."""
+    """Sums over the contacts of every grain: one scatter over all ends costs less than one for
+    each.
+    """
     ends: Int[Array, " two_contacts"] = jnp.concatenate([contacts.i, contacts.j])
     total = jnp.zeros((grains, at_i.shape[1]), at_i.dtype)
     return added_at(total, ends, jnp.concatenate([at_i, at_j]))

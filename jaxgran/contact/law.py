@@ -1,12 +1,13 @@
 """The law of a contact: arithmetic that both engines share.
 
-These functions take numbers or arrays and have no branches on values. The engine ``Jax`` calls them with arrays of JAX;
-the numba engine compiles the same source for numbers (``dynamics.numba_engine.compilation``). What branches, such as
-the search for the next contact or a solver, is written for each engine, and tests compare them.
+These functions take numbers or arrays and have no branches on values. The engine ``Jax`` calls them
+with arrays of JAX; the numba engine compiles the same source for numbers
+(``dynamics.numba_engine.compilation``). What branches, such as the search for the next contact or a
+solver, is written for each engine, and tests compare them.
 
-The rule: a pair is a contact when free flight over the look-ahead time θ·dt makes it overlap. With s the separation,
-u the relative velocity in the laboratory and d the sum of the radii, the gap along the flight is
-f(t) = |s + u t|² − d² = |u|² t² + 2 s·u t + |s|² − d².
+The rule: a pair is a contact when free flight over the look-ahead time θ·dt makes it overlap. With
+  s the separation, u the relative velocity in the laboratory and d the sum of the radii, the gap
+  along the flight is f(t) = |s + u t|² − d² = |u|² t² + 2 s·u t + |s|² − d².
 """
 
 from typing import Any
@@ -18,23 +19,31 @@ from jaxgran.model.status import DEEP_OVERLAP
 
 Number = Any  # a number, or an array of them
 
-LONGEST_STRIDE = 1e4  # step length of the method of Barzilai and Borwein, in units of that of Nesterov's
+LONGEST_STRIDE = (
+    1e4  # step length of the method of Barzilai and Borwein, in units of that of Nesterov's
+)
 WINDOW = 100  # iterations after which the progress of that method is judged
 PROGRESS = 0.5  # factor by which the best residual must have fallen within a window
-JAMMED_RESPONSE = 1e-2  # pᵀWp over −pᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
+JAMMED_RESPONSE = (
+    1e-2  # pᵀWp over −pᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
+)
 ABSOLUTE_RESIDUAL = 10  # roundings of the velocity γ̇σ that a residual may always keep
 
 
-def gap_coefficients(x: Number, y: Number, ux: Number, uy: Number, reach: Number) -> tuple[Number, Number, Number]:
+def gap_coefficients(
+    x: Number, y: Number, ux: Number, uy: Number, reach: Number
+) -> tuple[Number, Number, Number]:
     """|u|², s·u and |s|² − d², the coefficients of the gap along a flight."""
     return ux * ux + uy * uy, x * ux + y * uy, x * x + y * y - reach * reach
 
 
-def overlaps_within(squared_speed: Array, closing: Array, excess: Array, look_ahead: Number) -> tuple:
+def overlaps_within(
+    squared_speed: Array, closing: Array, excess: Array, look_ahead: Number
+) -> tuple:
     """The activation rule: whether pairs are contacts, and whether they approach.
 
-    The gap falls until the closest approach, so it is read at θ·dt or at the closest approach, whichever comes first.
-    A receding pair is judged at θ·dt.
+    The gap falls until the closest approach, so it is read at θ·dt or at the closest approach,
+    whichever comes first. A receding pair is judged at θ·dt.
 
     Args:
       squared_speed, closing, excess: |u|², s·u and |s|² − d², see ``gap_coefficients``.
@@ -42,7 +51,9 @@ def overlaps_within(squared_speed: Array, closing: Array, excess: Array, look_ah
     """
     approaching = closing < 0
     before_closest = -closing < squared_speed * look_ahead
-    t = where(approaching & before_closest, -closing / where(approaching, squared_speed, 1), look_ahead)
+    t = where(
+        approaching & before_closest, -closing / where(approaching, squared_speed, 1), look_ahead
+    )
     return excess + t * (2 * closing + t * squared_speed) <= 0, approaching
 
 
@@ -52,19 +63,24 @@ def gap_discriminant(squared_speed: Number, closing: Number, excess: Number) -> 
 
 
 def touching_time(closing: Number, excess: Number, root: Number) -> Number:
-    """Time at which an approaching pair touches, from the square root of the discriminant; no cancellation."""
+    """Time at which an approaching pair touches, from the square root of the discriminant; no
+    cancellation.
+    """
     return excess / (root - closing)
 
 
 def first_step(time: Number, timestep: Number, fraction: Number) -> Number:
-    """The activation rule in steps: the first step whose look-ahead, a fraction θ of it, reaches a time."""
+    """The activation rule in steps: the first step whose look-ahead, a fraction θ of it, reaches a
+    time.
+    """
     return ceil(time / timestep - fraction)
 
 
 def time_to_touch(squared_speed: Array, closing: Array, excess: Array) -> tuple:
     """Time at which free flight makes a pair touch, and time of its closest approach.
 
-    The time is negative for an approaching pair that overlaps already and infinite for a pair that never touches.
+    The time is negative for an approaching pair that overlaps already and infinite for a pair that
+    never touches.
     """
     discriminant = gap_discriminant(squared_speed, closing, excess)
     touches = (closing < 0) & (discriminant >= 0)
@@ -74,7 +90,8 @@ def time_to_touch(squared_speed: Array, closing: Array, excess: Array) -> tuple:
 
 
 def flight_of(cx: Number, cy: Number, strain: Number, flight: Number, shear_rate: Number) -> tuple:
-    """Displacements of a free flight in the frame that shears with the flow, and the peculiar velocity c_x after it.
+    """Displacements of a free flight in the frame that shears with the flow, and the peculiar
+    velocity c_x after it.
 
     Args:
       cx, cy: peculiar velocities before; c_y stays as it is.
@@ -85,13 +102,20 @@ def flight_of(cx: Number, cy: Number, strain: Number, flight: Number, shear_rate
     return dx, cy * flight, cx - shear_rate * flight * cy
 
 
-def kinetic_means(xx: Number, xy: Number, yy: Number, strain: Number) -> tuple[Number, Number, Number]:
-    """Means of c_x c_x, c_x c_y and c_y c_y over a flight of strain ``strain``, in which c_x falls by γ̇ c_y t."""
+def kinetic_means(
+    xx: Number, xy: Number, yy: Number, strain: Number
+) -> tuple[Number, Number, Number]:
+    """Means of c_x c_x, c_x c_y and c_y c_y over a flight of strain ``strain``, in which c_x falls
+    by γ̇ c_y t.
+    """
     return xx - strain * xy + strain * strain / 3 * yy, xy - strain / 2 * yy, yy
 
 
-def residual_target(scale: Number, tolerance: Number, shear_rate: Number, epsilon: Number) -> Number:
-    """The residual at which a solve ends: relative to ‖min(u⁻, 0)‖, with an absolute part for rounding.
+def residual_target(
+    scale: Number, tolerance: Number, shear_rate: Number, epsilon: Number
+) -> Number:
+    """The residual at which a solve ends: relative to ‖min(u⁻, 0)‖, with an absolute part for
+    rounding.
 
     Args:
       scale: ‖min(u⁻, 0)‖ over the contacts.
@@ -101,7 +125,9 @@ def residual_target(scale: Number, tolerance: Number, shear_rate: Number, epsilo
 
 
 def relative_residual(residual: Number, scale: Number, target: Number) -> Number:
-    """A residual over ‖min(u⁻, 0)‖, or over the target where that is larger; zero without shear and approach."""
+    """A residual over ‖min(u⁻, 0)‖, or over the target where that is larger; zero without shear and
+    approach.
+    """
     floor = maximum(scale, target)
     return residual / where(floor > 0, floor, 1)
 
@@ -126,7 +152,8 @@ def contact_terms(
     loaded: Number,
     approaching: Number,
 ) -> tuple:
-    """What one contact adds to the running sums, in the order of the rows of ``dynamics.tally`` for contacts.
+    """What one contact adds to the running sums, in the order of the rows of ``dynamics.tally`` for
+    contacts.
 
     Args:
       nx, ny, distance: unit normal and distance of the centres, in σ.
@@ -135,11 +162,13 @@ def contact_terms(
       half_change: half its change by the impulses, (u⁺ − u⁻)/2.
       one_plus_alpha: 1 + α.
       impulse, binary_impulse: p = (1 + α) p₀, and the same if the collision were binary.
-      clustered: the impulse p where the contact is in a cluster, otherwise 0.
-      used, loaded, approaching: 1 where it is a contact, carries an impulse, approaches; otherwise 0.
+      clustered: the impulse p where the contact is in a cluster, otherwise 0. used, loaded,
+        approaching: 1 where it is a contact, carries an impulse, approaches; otherwise 0.
     """
     xx, xy, yy = nx * nx * distance, nx * ny * distance, ny * ny * distance
-    binary_speed = -binary_impulse * approach  # the impulse is zero where the contact does not approach
+    binary_speed = (
+        -binary_impulse * approach
+    )  # the impulse is zero where the contact does not approach
     return (
         impulse,
         binary_impulse,

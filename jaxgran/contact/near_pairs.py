@@ -1,19 +1,23 @@
 """PairList: near pairs with frozen separations, and how long the list is valid.
 
-Separations are stored once, when a list is built. In coordinates that move with the sheared cell they follow
-from the displacements δ of the grains since then and from the strain γ since then, without images or tilt:
+Separations are stored once, when a list is built. In coordinates that move with the sheared cell
+they follow from the displacements δ of the grains since then and from the strain γ since then,
+without images or tilt:
 
-    Δy = Δy₀ + δy_i − δy_j,    Δx = Δx₀ + δx_i − δx_j + γ Δy,    dδx/dt = c_x − γ c_y,  dδy/dt = c_y.
+    Δy = Δy₀ + δy_i − δy_j,    Δx = Δx₀ + δx_i − δx_j + γ Δy,    dδx/dt = c_x − γ c_y,  dδy/dt =
+    c_y.
 
-There are two lists. The outer one has a large skin and is searched seldom; the near one, which every event reads,
-is filtered from it often. A list with skin s holds every pair whose gap was at most s when it was built. Two
-grains within a distance r now have |Δy| ≤ r, so no such pair is missed as long as its gap is at most
+There are two lists. The outer one has a large skin and is searched seldom; the near one, which
+every event reads, is filtered from it often. A list with skin s holds every pair whose gap was at
+most s when it was built. Two grains within a distance r now have |Δy| ≤ r, so no such pair is
+missed as long as its gap is at most
 
     s − 2 max|δ| (1 + |γ_ref|) − r |γ − γ_ref|
 
-with δ counted from the build of the list and γ_ref the strain of the frame at that time. The outer list is judged by
-this before a near list is filtered from it, with r the largest diameter and the skin of the near list. The near list is
-judged in ``dynamics.step`` by a bound on the speed at which a gap closes, which costs less and is as safe.
+with δ counted from the build of the list and γ_ref the strain of the frame at that time. The outer
+list is judged by this before a near list is filtered from it, with r the largest diameter and the
+skin of the near list. The near list is judged in ``dynamics.step`` by a bound on the speed at which
+a gap closes, which costs less and is as safe.
 """
 
 from dataclasses import dataclass
@@ -35,13 +39,17 @@ NEAR_PAIRS_PER_GRAIN = 4
 OUTER_PAIRS_PER_GRAIN = 10
 _WORD, _FEW_WORDS = 32, 128
 _FILL = 0.8  # share of a buffer that the expected number of pairs may take
-_NARROWER, _LEAST_SHARE = 0.7, 0.15  # of the skin, where the grains cluster and a buffer is too small
+_NARROWER, _LEAST_SHARE = (
+    0.7,
+    0.15,
+)  # of the skin, where the grains cluster and a buffer is too small
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PairList:
-    """Pairs i, j that may touch, with their separations when the frame was frozen; empty slots lie far apart.
+    """Pairs i, j that may touch, with their separations when the frame was frozen; empty slots lie
+    far apart.
 
     ===========  ===========  ====  ==========================================
     field        shape        unit  meaning
@@ -98,7 +106,11 @@ class PairLists:
 
 def separations_now(pairs: PairList, frame: Frame) -> Float[Array, "pairs 2"]:
     """Separations r_i − r_j of the pairs after the motion of the frame."""
-    d = pairs.separations + taken(frame.displacements, pairs.i) - taken(frame.displacements, pairs.j)
+    d = (
+        pairs.separations
+        + taken(frame.displacements, pairs.i)
+        - taken(frame.displacements, pairs.j)
+    )
     return sheared(d, frame.strain)
 
 
@@ -125,14 +137,23 @@ def no_lists(positions: Float[Array, "grains 2"], tilt: Array) -> PairLists:
 
     def empty(pairs_per_grain: int) -> PairList:
         slots, dtype = _capacity(pairs_per_grain, len(positions)), positions.dtype
-        none, far = jnp.zeros(slots, jnp.int32), jnp.broadcast_to(jnp.asarray([1e6, 0], dtype), (slots, 2))
-        return PairList(none, none, far, jnp.zeros(slots, dtype), jnp.asarray(-jnp.inf, dtype), jnp.bool_(False))
+        none, far = (
+            jnp.zeros(slots, jnp.int32),
+            jnp.broadcast_to(jnp.asarray([1e6, 0], dtype), (slots, 2)),
+        )
+        return PairList(
+            none, none, far, jnp.zeros(slots, dtype), jnp.asarray(-jnp.inf, dtype), jnp.bool_(False)
+        )
 
     at_rest = Frame(jnp.zeros_like(positions), jnp.zeros_like(tilt))
-    return PairLists(empty(OUTER_PAIRS_PER_GRAIN), empty(NEAR_PAIRS_PER_GRAIN), at_rest, at_rest, positions, tilt)
+    return PairLists(
+        empty(OUTER_PAIRS_PER_GRAIN), empty(NEAR_PAIRS_PER_GRAIN), at_rest, at_rest, positions, tilt
+    )
 
 
-def pair_lists(positions: Float[Array, "grains 2"], grains: Grains, side: Array, tilt: Array) -> PairLists:
+def pair_lists(
+    positions: Float[Array, "grains 2"], grains: Grains, side: Array, tilt: Array
+) -> PairLists:
     """Both lists, built from the positions; the frame starts here."""
     at_rest = Frame(jnp.zeros_like(positions), jnp.zeros_like(side))
     outer = outer_pairs(positions, grains, side, tilt)
@@ -142,7 +163,8 @@ def pair_lists(positions: Float[Array, "grains 2"], grains: Grains, side: Array,
 
 
 def refresh(lists: PairLists, grains: Grains, side: Array, stale: Bool[Array, ""]) -> PairLists:
-    """The lists with a new near list where it is ``stale``, and both anew where the outer list is used up.
+    """The lists with a new near list where it is ``stale``, and both anew where the outer list is
+    used up.
 
     Args:
       lists: the present lists.
@@ -162,15 +184,18 @@ def refresh(lists: PairLists, grains: Grains, side: Array, stale: Bool[Array, ""
 
     kept = lists.outer, lists.frame, lists.positions, lists.tilt
     outer, frame, positions, tilt = lax.cond(any_replica(search), searched, lambda: kept)
-    near = _near_pairs(outer, frame, jnp.minimum(nominal, jnp.where(search, outer.skin, remaining)), grains)
+    near = _near_pairs(
+        outer, frame, jnp.minimum(nominal, jnp.where(search, outer.skin, remaining)), grains
+    )
     return where_active(stale, PairLists(outer, near, frame, frame, positions, tilt), lists)
 
 
 def first_true(mask: Bool[Array, " m"], size: int) -> Int[Array, " size"]:
     """Indices of the first ``size`` True entries, padded with the length of the mask.
 
-    Rank and select on words of 32 bits. The word that holds the k-th True entry follows from the running number of
-    set bits, and its place in the word by halving. Inside a step this costs a tenth of ``jnp.nonzero``.
+    Rank and select on words of 32 bits. The word that holds the k-th True entry follows from the
+    running number of set bits, and its place in the word by halving. Inside a step this costs a
+    tenth of ``jnp.nonzero``.
 
     Examples:
       >>> first_true(jnp.array([False, True, True, False, True]), 4).tolist()
@@ -194,28 +219,38 @@ def set_bits(words: UInt32[Array, " words"], size: int, length: int) -> Int[Arra
     wanted = jnp.arange(size, dtype=jnp.int32)
     if count <= _FEW_WORDS:
         triangle = np.tri(count, dtype=bool)
-        running = jnp.sum(jnp.where(triangle, set_in_word[None, :], np.int32(0)), axis=1, dtype=jnp.int32)
+        running = jnp.sum(
+            jnp.where(triangle, set_in_word[None, :], np.int32(0)), axis=1, dtype=jnp.int32
+        )
         word = jnp.sum(running[None, :] <= wanted[:, None], axis=1, dtype=jnp.int32)
     else:
         running = jnp.cumsum(set_in_word, dtype=jnp.int32)
-        word = jnp.searchsorted(running, wanted, side="right", method="scan_unrolled").astype(jnp.int32)
+        word = jnp.searchsorted(running, wanted, side="right", method="scan_unrolled").astype(
+            jnp.int32
+        )
     within = jnp.minimum(word, count - 1)
     place = set_bit(taken(words, within), wanted - taken(running - set_in_word, within))
     return jnp.where(word < count, within * _WORD + place, length)
 
 
 def _nominal_skin(pairs_per_grain: int, grains: Grains, side: Array) -> Float[Array, ""]:
-    """The skin at which a homogeneous flow fills a buffer to its expected share; at most half the cell."""
+    """The skin at which a homogeneous flow fills a buffer to its expected share; at most half the
+    cell.
+    """
     density = grains.radii.size / side**2
     reach = jnp.sqrt(2 * _FILL * pairs_per_grain / (jnp.pi * density))
     return jnp.minimum(reach - 1, widest_skin(grains, side))
 
 
 def widest_skin(grains: Grains, side: Array) -> Float[Array, ""]:
-    """The largest skin of lists of these grains: nearest images are unique, and the grid of cells is fine enough."""
+    """The largest skin of lists of these grains: nearest images are unique, and the grid of cells
+    is fine enough.
+    """
     count, reach = grains.radii.size, side / 2
     if count > ALL_PAIRS_LIMIT:
-        reach = jnp.minimum(reach, largest_cutoff(count, side, _capacity(OUTER_PAIRS_PER_GRAIN, count)))
+        reach = jnp.minimum(
+            reach, largest_cutoff(count, side, _capacity(OUTER_PAIRS_PER_GRAIN, count))
+        )
     return reach - 2 * jnp.max(grains.radii)
 
 
@@ -226,13 +261,16 @@ def _capacity(pairs_per_grain: int, count: int) -> int:
 def _select(
     gaps: Float[Array, " m"], largest_skin: Array, capacity: int
 ) -> tuple[Int[Array, " pairs"], Bool[Array, " pairs"], Array, Array]:
-    """Pairs with a gap within the largest skin for which a buffer has room: the first skin tried nearly always fits.
+    """Pairs with a gap within the largest skin for which a buffer has room: the first skin tried
+    nearly always fits.
 
     Returns:
-      Where the pairs stand among the gaps, which slots of the buffer they fill, the skin, and whether even the smallest
-      skin leaves pairs out.
+      Where the pairs stand among the gaps, which slots of the buffer they fill, the skin, and
+      whether even the smallest skin leaves pairs out.
     """
-    gaps, largest_skin = lax.stop_gradient((gaps, largest_skin))  # the choice of pairs has no derivative
+    gaps, largest_skin = lax.stop_gradient(
+        (gaps, largest_skin)
+    )  # the choice of pairs has no derivative
 
     def crowded(now: tuple[Array, Array]) -> Array:
         skin, words = now
@@ -260,7 +298,9 @@ def _pair_list(i, j, separations, filled, grains: Grains, skin, overflow) -> Pai
     return PairList(
         i=i,
         j=j,
-        separations=jnp.where(filled[:, None], separations, jnp.asarray([[1e6, 0]], separations.dtype)),
+        separations=jnp.where(
+            filled[:, None], separations, jnp.asarray([[1e6, 0]], separations.dtype)
+        ),
         reach=jnp.where(filled, taken(grains.radii, i) + taken(grains.radii, j), 0),
         skin=skin,
         overflow=overflow,
@@ -268,7 +308,9 @@ def _pair_list(i, j, separations, filled, grains: Grains, skin, overflow) -> Pai
 
 
 def _near_pairs(outer: PairList, frame: Frame, largest: Array, grains: Grains) -> PairList:
-    """The pairs of the outer list within the largest skin now, with the frozen separations of the outer list."""
+    """The pairs of the outer list within the largest skin now, with the frozen separations of the
+    outer list.
+    """
     distance = jnp.sqrt(jnp.sum(separations_now(outer, frame) ** 2, axis=-1))
     capacity = _capacity(NEAR_PAIRS_PER_GRAIN, grains.radii.size)
     at, filled, skin, overflow = _select(distance - outer.reach, largest, capacity)
@@ -276,22 +318,37 @@ def _near_pairs(outer: PairList, frame: Frame, largest: Array, grains: Grains) -
     return _pair_list(i, j, separations, filled, grains, skin, overflow | outer.overflow)
 
 
-def outer_pairs(positions: Float[Array, "grains 2"], grains: Grains, side: Array, tilt: Array) -> PairList:
-    """All pairs within the outer skin, by comparing all pairs or, for many grains, through a cell list."""
+def outer_pairs(
+    positions: Float[Array, "grains 2"], grains: Grains, side: Array, tilt: Array
+) -> PairList:
+    """All pairs within the outer skin, by comparing all pairs or, for many grains, through a cell
+    list.
+    """
     count = positions.shape[0]
     capacity = _capacity(OUTER_PAIRS_PER_GRAIN, count)
     largest = _nominal_skin(OUTER_PAIRS_PER_GRAIN, grains, side)
     if count > ALL_PAIRS_LIMIT:
-        i, j, missed = cell_list_pairs(positions, side, tilt, largest + 2 * jnp.max(grains.radii), capacity)
+        i, j, missed = cell_list_pairs(
+            positions, side, tilt, largest + 2 * jnp.max(grains.radii), capacity
+        )
         separations = displacement(taken(positions, i), taken(positions, j), side, tilt)
         reach = jnp.where(i == j, -jnp.inf, taken(grains.radii, i) + taken(grains.radii, j))
-        at, filled, skin, overflow = _select(jnp.sqrt(jnp.sum(separations**2, axis=-1)) - reach, largest, capacity)
+        at, filled, skin, overflow = _select(
+            jnp.sqrt(jnp.sum(separations**2, axis=-1)) - reach, largest, capacity
+        )
         i, j, overflow = taken(i, at), taken(j, at), overflow | missed
     else:
         separations = displacement(positions[:, None], positions[None, :], side, tilt)
-        gaps = jnp.sqrt(jnp.sum(separations**2, axis=-1)) - grains.radii[:, None] - grains.radii[None, :]
+        gaps = (
+            jnp.sqrt(jnp.sum(separations**2, axis=-1))
+            - grains.radii[:, None]
+            - grains.radii[None, :]
+        )
         gaps = jnp.where(jnp.triu(jnp.ones((count, count), bool), 1), gaps, jnp.inf).reshape(-1)
         at, filled, skin, overflow = _select(gaps, largest, capacity)
-        i, j = lax.div(at, jnp.int32(count)), lax.rem(at, jnp.int32(count))  # without the cases of negative numbers
+        i, j = (
+            lax.div(at, jnp.int32(count)),
+            lax.rem(at, jnp.int32(count)),
+        )  # without the cases of negative numbers
     separations = displacement(taken(positions, i), taken(positions, j), side, tilt)
     return _pair_list(i, j, separations, filled, grains, skin, overflow)

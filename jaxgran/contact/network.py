@@ -22,17 +22,18 @@ MOST_CONTACTS = 3  # of a grain: the contacts of discs form a planar graph
 class Contacts:
     """The contact network of one step; unused slots have zero normals and zero inverse masses.
 
-    ==============  =============  ====  ====================================================================
+    ==============  =============  ====  ===========================================================
     field           shape          unit  meaning
-    ==============  =============  ====  ====================================================================
+    ==============  =============  ====  ===========================================================
     i, j            (contacts,)    –     grains in contact
     normals         (contacts, 2)  –     unit vectors n from grain j to grain i
     distances       (contacts,)    σ     distance of the centres
-    approach        (contacts,)    σγ̇    relative normal velocity u⁻ before the step, negative if approaching
+    approach        (contacts,)    σγ̇    relative normal velocity u⁻ before the step, negative if
+                                         approaching
     inverse_mass_i  (contacts,)    1/m   1/m of grain i
     inverse_mass_j  (contacts,)    1/m   1/m of grain j
     used            (contacts,)    –     True where the slot holds a contact
-    ==============  =============  ====  ====================================================================
+    ==============  =============  ====  ===========================================================
     """
 
     i: Int[Array, " contacts"]
@@ -48,7 +49,8 @@ class Contacts:
 
 
 class PairMotion(NamedTuple):
-    """Separations r_i − r_j of pairs in σ, and relative velocities in the laboratory frame in σγ̇, (pairs,) each.
+    """Separations r_i − r_j of pairs in σ, and relative velocities in the laboratory frame in σγ̇,
+    (pairs,) each.
 
     Each component is an array of its own, which XLA vectorises.
     """
@@ -70,7 +72,9 @@ def pair_motion(
     velocities: Float[Array, "grains 2"],
     shear_rate: float | Array,
 ) -> PairMotion:
-    """How pairs of grains i and j with these separations move, from the peculiar velocities of the grains."""
+    """How pairs of grains i and j with these separations move, from the peculiar velocities of the
+    grains.
+    """
     u = relative_velocity(velocities, i, j, separations, shear_rate)
     return PairMotion(separations[:, 0], separations[:, 1], u[:, 0], u[:, 1])
 
@@ -80,9 +84,9 @@ def is_contact(
 ) -> tuple[Bool[Array, " pairs"], Bool[Array, " pairs"]]:
     """Which pairs are contacts, and which of them approach.
 
-    A pair is a contact when free flight over the look-ahead time θ·dt makes it overlap. Along the flight
-    f(t) = |s + u t|² − d² falls until the closest approach, so f is read at θ·dt or at the closest approach,
-    whichever comes first; a receding pair is judged at θ·dt.
+    A pair is a contact when free flight over the look-ahead time θ·dt makes it overlap. Along the
+    flight f(t) = |s + u t|² − d² falls until the closest approach, so f is read at θ·dt or at the
+    closest approach, whichever comes first; a receding pair is judged at θ·dt.
 
     Args:
       pairs: how the pairs move.
@@ -106,7 +110,8 @@ def first_contact_time(
 ) -> tuple[Float[Array, " pairs"], Float[Array, " pairs"]]:
     """Time at which free flight makes a pair touch, and time of its closest approach.
 
-    The time is negative for an approaching pair that overlaps already and infinite for a pair that never touches.
+    The time is negative for an approaching pair that overlaps already and infinite for a pair that
+    never touches.
 
     Examples:
       >>> pairs = PairMotion(jnp.array([2.0]), jnp.zeros(1), jnp.array([-1.0]), jnp.zeros(1))
@@ -124,7 +129,9 @@ def contact_network(
     pairs: PairMotion,
     grains: Grains,
 ) -> Contacts:
-    """The network of the pairs of grains i and j that are contacts (``used``), a slot for each pair."""
+    """The network of the pairs of grains i and j that are contacts (``used``), a slot for each
+    pair.
+    """
     distances = jnp.sqrt(pairs.x * pairs.x + pairs.y * pairs.y)
     inverse_distances, inverse_masses = jnp.where(used, 1 / distances, 0), 1 / grains.masses
     nx, ny = inverse_distances * pairs.x, inverse_distances * pairs.y
@@ -141,7 +148,9 @@ def contact_network(
 
 
 class Touching(NamedTuple):
-    """The pairs of the near list, or those compacted from it, (pairs,) each, and which of them are contacts."""
+    """The pairs of the near list, or those compacted from it, (pairs,) each, and which of them are
+    contacts.
+    """
 
     i: Int[Array, " pairs"]
     j: Int[Array, " pairs"]
@@ -150,7 +159,9 @@ class Touching(NamedTuple):
     contact: Bool[Array, " pairs"]
 
     def compacted(self, size: int, words: Array) -> "Touching":
-        """The first contacts in a buffer of a size; ``words`` are those of ``bit_words(contact)``."""
+        """The first contacts in a buffer of a size; ``words`` are those of
+        ``bit_words(contact)``.
+        """
         pairs = self.contact.size
         place = set_bits(words, size, pairs)
         used = place < pairs

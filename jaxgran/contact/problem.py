@@ -1,7 +1,7 @@
 """Contact problems of any origin: a network of discs, or a Delassus matrix.
 
-Both are what ``solve_contacts`` takes. Neither is checked when it is made, so that JAX may fill them with whatever it
-needs; ``problem_checks`` judges them where they are used.
+Both are what ``solve_contacts`` takes. Neither is checked when it is made, so that JAX may fill
+them with whatever it needs; ``problem_checks`` judges them where they are used.
 """
 
 from dataclasses import dataclass
@@ -20,17 +20,19 @@ from jaxgran.model.batches import equal_values
 class ContactNetwork:
     """Frictionless contacts of grains that do not rotate: a contact problem by its geometry.
 
-    ========  =============  ====  ==========================================================================
+    ========  =============  ====  =================================================================
     field     shape          unit  meaning
-    ========  =============  ====  ==========================================================================
+    ========  =============  ====  =================================================================
     ends      (contacts, 2)  –     numbers i and j of the two grains
-    normals   (contacts, 2)  –     unit vectors n from grain j to grain i; zero in a slot that is not used
+    normals   (contacts, 2)  –     unit vectors n from grain j to grain i; zero in a slot that is
+                                   not used
     masses    (grains,)      m     masses of the grains, infinite for a wall
-    approach  (contacts,)    σγ̇    relative normal velocity u⁻ = n·(v_i − v_j) before, negative if approaching
-    ========  =============  ====  ==========================================================================
+    approach  (contacts,)    σγ̇    relative normal velocity u⁻ = n·(v_i − v_j) before, negative if
+                                   approaching
+    ========  =============  ====  =================================================================
 
-    A batch has a leading axis in every field and is solved by ``jax.vmap``. Slots with zero normals fill up networks
-    to a common size; their impulses are zero.
+    A batch has a leading axis in every field and is solved by ``jax.vmap``. Slots with zero normals
+    fill up networks to a common size; their impulses are zero.
 
     Examples:
       A disc hits a row of two that touch:
@@ -56,17 +58,20 @@ class ContactNetwork:
 class DelassusProblem:
     """A contact problem by its Delassus matrix, which any mechanical system without friction has.
 
-    ========  ====================  ====  ========================================================================
+    ========  ====================  ====  ==========================================================
     field     shape                 unit  meaning
-    ========  ====================  ====  ========================================================================
-    matrix    (contacts, contacts)  1/m   W = H M⁻¹ Hᵀ, symmetric, without negative eigenvalues; a dense array, a
-                                          matrix of ``scipy.sparse`` or a ``BCOO`` of ``jax.experimental.sparse``
-    approach  (contacts,)           σγ̇    relative normal velocity u⁻ before, negative if approaching
-    ========  ====================  ====  ========================================================================
+    ========  ====================  ====  ==========================================================
+    matrix    (contacts, contacts)  1/m   W = H M⁻¹ Hᵀ, symmetric, without negative eigenvalues; a
+                                          dense array, a
+                                          matrix of ``scipy.sparse`` or a ``BCOO`` of
+                                          ``jax.experimental.sparse``
+    approach  (contacts,)           σγ̇    relative normal velocity u⁻ before, negative if
+                                          approaching
+    ========  ====================  ====  ==========================================================
 
-    A matrix of ``scipy.sparse`` becomes a ``BCOO``. Rows of the unit matrix with u⁻ = 0 fill up problems to a common
-    size. A batch has a leading axis, which is a batch dimension of a ``BCOO``, and is solved by ``jax.vmap``.
-    Derivatives are those along symmetric changes of the matrix.
+    A matrix of ``scipy.sparse`` becomes a ``BCOO``. Rows of the unit matrix with u⁻ = 0 fill up
+    problems to a common size. A batch has a leading axis, which is a batch dimension of a ``BCOO``,
+    and is solved by ``jax.vmap``. Derivatives are those along symmetric changes of the matrix.
     """
 
     matrix: Any

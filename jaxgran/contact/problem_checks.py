@@ -1,7 +1,9 @@
-"""What a contact problem must be, judged where it is used; values that JAX traces pass, their shapes do not.
+"""What a contact problem must be, judged where it is used; values that JAX traces pass, their
+shapes do not.
 
-Shapes are known even inside of ``jit``. Values are judged outside of it, where a mistake can be said in a sentence.
-Inside, a solve ends with a status. "ok" then still means that the residual is small, whatever the matrix is.
+Shapes are known even inside of ``jit``. Values are judged outside of it, where a mistake can be
+said in a sentence. Inside, a solve ends with a status. "ok" then still means that the residual is
+small, whatever the matrix is.
 """
 
 from typing import Any
@@ -11,22 +13,35 @@ import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts are loaded when they are used
 
-from jaxgran.contact.problem import ContactNetwork, ContactProblem, DelassusProblem, entries, is_sparse
+from jaxgran.contact.problem import (
+    ContactNetwork,
+    ContactProblem,
+    DelassusProblem,
+    entries,
+    is_sparse,
+)
 from jaxgran.model.checks import InputError, as_array, concrete_or_none, require, short_repr
 
-LARGEST_FACTORED = 2048  # contacts of a matrix whose eigenvalues are judged; Cholesky's factor of it takes 0.1 s
-_UNIT_LENGTH = 1e-5  # by which the length of a normal may differ from one; float32 and typed digits pass
+LARGEST_FACTORED = (
+    2048  # contacts of a matrix whose eigenvalues are judged; Cholesky's factor of it takes 0.1 s
+)
+_UNIT_LENGTH = (
+    1e-5  # by which the length of a normal may differ from one; float32 and typed digits pass
+)
 _BATCH = "a batch of problems is solved by jax.vmap(jaxgran.solve_contacts)"
 _FINITE = "finite numbers"
 
 
 def check_problem(problem: Any) -> None:
-    """Raise an InputError unless this is a contact problem whose shapes fit and whose values can be.
+    """Raise an InputError unless this is a contact problem whose shapes fit and whose values can
+    be.
 
     See ``solve_contacts`` for what is checked.
     """
     if not isinstance(problem, ContactNetwork | DelassusProblem):
-        raise InputError(f"problem must be a ContactNetwork or a DelassusProblem, not {short_repr(problem)}.")
+        raise InputError(
+            f"problem must be a ContactNetwork or a DelassusProblem, not {short_repr(problem)}."
+        )
     arrays = _as_arrays(problem)
     _require_network(arrays) if isinstance(arrays, ContactNetwork) else _require_delassus(arrays)
 
@@ -37,7 +52,9 @@ def as_problem(problem: ContactProblem) -> ContactProblem:
     if isinstance(arrays, ContactNetwork):
         numbers = arrays.normals, arrays.masses, arrays.approach
         kind = _precision(*numbers)
-        return ContactNetwork(jnp.asarray(arrays.ends, jnp.int32), *(jnp.asarray(x, kind) for x in numbers))
+        return ContactNetwork(
+            jnp.asarray(arrays.ends, jnp.int32), *(jnp.asarray(x, kind) for x in numbers)
+        )
     matrix, kind = arrays.matrix, _precision(arrays.matrix, arrays.approach)
     matrix_of_kind = matrix.astype(kind) if is_sparse(matrix) else jnp.asarray(matrix, kind)
     return DelassusProblem(matrix_of_kind, jnp.asarray(arrays.approach, kind))
@@ -47,12 +64,16 @@ def _as_arrays(problem: ContactProblem) -> ContactProblem:
     """The problem with arrays in place of lists."""
     if isinstance(problem, DelassusProblem):
         return DelassusProblem(as_array(problem.matrix), as_array(problem.approach))
-    ends: Any = np.asarray(problem.ends) if isinstance(problem.ends, (list, tuple)) else problem.ends
+    ends: Any = (
+        np.asarray(problem.ends) if isinstance(problem.ends, (list, tuple)) else problem.ends
+    )
     return ContactNetwork(ends, *map(as_array, (problem.normals, problem.masses, problem.approach)))
 
 
 def require_impulses(problem: ContactProblem, impulses: Any) -> jax.Array:
-    """The impulses in the precision of the problem; an InputError unless there is one for each contact."""
+    """The impulses in the precision of the problem; an InputError unless there is one for each
+    contact.
+    """
     impulses = as_array(impulses)
     _require_shape("impulses", impulses, problem.approach.shape, "a number for each contact")
     return jnp.asarray(impulses, problem.approach.dtype)
@@ -63,11 +84,19 @@ def _require_network(network: ContactNetwork) -> None:
     _require_shape("ends", network.ends, (count, 2), "two grains for each contact")
     _require_shape("normals", network.normals, (count, 2), "a unit vector for each contact")
     if np.ndim(network.masses) != 1 or np.size(network.masses) == 0:
-        raise InputError(f"masses must be an array (grains,), not of the shape {np.shape(network.masses)}; {_BATCH}.")
+        raise InputError(
+            f"masses must be an array (grains,), not of the shape {np.shape(network.masses)}; "
+            f"{_BATCH}."
+        )
     grains = np.shape(network.masses)[0]
     if not np.issubdtype(network.ends.dtype, np.integer):
         raise InputError(f"ends must be whole numbers, not of the type {network.ends.dtype}.")
-    require("ends", network.ends, lambda x: (x >= 0) & (x < grains), f"numbers of grains, 0 to {grains - 1}")
+    require(
+        "ends",
+        network.ends,
+        lambda x: (x >= 0) & (x < grains),
+        f"numbers of grains, 0 to {grains - 1}",
+    )
     require("masses", network.masses, lambda x: x > 0, "positive, or infinite for a wall")
     require("approach", network.approach, np.isfinite, _FINITE)
     require("normals", network.normals, np.isfinite, _FINITE)
@@ -89,9 +118,16 @@ def _require_network(network: ContactNetwork) -> None:
         return
     same_grain = (lengths > 0) & (ends[:, 0] == ends[:, 1])
     if np.any(same_grain):
-        raise InputError(f"ends must be two different grains, and contact {np.argmax(same_grain)} has one grain twice.")
-    if masses is not None and np.any(held := (lengths > 0) & np.all(np.isinf(masses[ends]), axis=1)):
-        raise InputError(f"contact {np.argmax(held)} joins two walls, which no impulse moves: leave it out.")
+        raise InputError(
+            f"ends must be two different grains, and contact {np.argmax(same_grain)} has one grain "
+            "twice."
+        )
+    if masses is not None and np.any(
+        held := (lengths > 0) & np.all(np.isinf(masses[ends]), axis=1)
+    ):
+        raise InputError(
+            f"contact {np.argmax(held)} joins two walls, which no impulse moves: leave it out."
+        )
 
 
 def _require_delassus(problem: DelassusProblem) -> None:
@@ -100,10 +136,13 @@ def _require_delassus(problem: DelassusProblem) -> None:
     if is_sparse(matrix):
         if matrix.n_batch or matrix.n_dense:
             raise InputError(
-                "a sparse matrix must have neither batch nor dense dimensions: use BCOO.fromdense(matrix)."
+                "a sparse matrix must have neither batch nor dense dimensions: use "
+                "BCOO.fromdense(matrix)."
             )
         if matrix.nse == 0:
-            raise InputError("matrix must have entries: a contact has a positive one on the diagonal.")
+            raise InputError(
+                "matrix must have entries: a contact has a positive one on the diagonal."
+            )
         require("matrix", matrix.data, np.isfinite, _FINITE)
     else:
         require("matrix", matrix, np.isfinite, _FINITE)
@@ -119,18 +158,29 @@ def _require_definite(matrix: Any) -> None:
     on_diagonal = matrix.diagonal()
     if not np.all(on_diagonal > 0):
         at = int(np.argmin(on_diagonal))
-        raise InputError(f"matrix must have a positive diagonal, and entry {at} of it is {on_diagonal[at]:.6g}.")
+        raise InputError(
+            f"matrix must have a positive diagonal, and entry {at} of it is {on_diagonal[at]:.6g}."
+        )
     root = np.sqrt(on_diagonal.astype(float))
-    scaled = matrix / root[:, None] / root if isinstance(matrix, np.ndarray) else _scaled(matrix, 1 / root)
+    scaled = (
+        matrix / root[:, None] / root
+        if isinstance(matrix, np.ndarray)
+        else _scaled(matrix, 1 / root)
+    )
     uneven, largest = abs(scaled - scaled.T).max(), abs(scaled).max()
     if uneven > np.sqrt(epsilon):
         raise InputError(
-            f"matrix must be symmetric, and entries differ from their mirror images by up to {uneven:.2g} of the "
+            "matrix must be symmetric, and entries differ from their mirror images by up to "
+            f"{uneven:.2g} of the "
             "diagonal: give (W + W.T) / 2 if that is rounding."
         )
     slack = 16 * len(on_diagonal) * epsilon
-    if largest > 1 + slack or (len(on_diagonal) <= LARGEST_FACTORED and not _is_definite(scaled, slack)):
-        raise InputError("matrix must have no negative eigenvalue, as W = H M⁻¹ Hᵀ has none, and this one has.")
+    if largest > 1 + slack or (
+        len(on_diagonal) <= LARGEST_FACTORED and not _is_definite(scaled, slack)
+    ):
+        raise InputError(
+            "matrix must have no negative eigenvalue, as W = H M⁻¹ Hᵀ has none, and this one has."
+        )
 
 
 def _is_definite(scaled: Any, slack: float) -> bool:
@@ -154,26 +204,38 @@ def _known_matrix(matrix: Any) -> Any:
     rows, columns, values = (concrete_or_none(x) for x in entries(matrix))
     if rows is None or columns is None or values is None:
         return None
-    inside = (rows < matrix.shape[0]) & (columns < matrix.shape[1])  # a BCOO is padded with indices outside of it
-    return scipy.sparse.coo_array((values[inside], (rows[inside], columns[inside])), shape=matrix.shape).tocsr()
+    inside = (rows < matrix.shape[0]) & (
+        columns < matrix.shape[1]
+    )  # a BCOO is padded with indices outside of it
+    return scipy.sparse.coo_array(
+        (values[inside], (rows[inside], columns[inside])), shape=matrix.shape
+    ).tocsr()
 
 
 def _contacts(problem: ContactProblem) -> int:
     shape = np.shape(problem.approach) if hasattr(problem.approach, "dtype") else None
     if shape is None or len(shape) != 1:
-        raise InputError(f"approach must be an array (contacts,), not {_described(problem.approach)}; {_BATCH}.")
+        raise InputError(
+            f"approach must be an array (contacts,), not {_described(problem.approach)}; {_BATCH}."
+        )
     if shape == (0,):
-        raise InputError("approach must have a number for at least one contact: this problem has none to solve.")
+        raise InputError(
+            "approach must have a number for at least one contact: this problem has none to solve."
+        )
     return shape[0]
 
 
 def _require_shape(name: str, value: Any, shape: tuple[int, ...], words: str) -> None:
     if not hasattr(value, "dtype") or np.shape(value) != shape:
-        raise InputError(f"{name} must be an array {shape}, {words}, not {_described(value)}; {_BATCH}.")
+        raise InputError(
+            f"{name} must be an array {shape}, {words}, not {_described(value)}; {_BATCH}."
+        )
 
 
 def _described(value: Any) -> str:
-    return f"of the shape {tuple(np.shape(value))}" if hasattr(value, "dtype") else short_repr(value)
+    return (
+        f"of the shape {tuple(np.shape(value))}" if hasattr(value, "dtype") else short_repr(value)
+    )
 
 
 def _precision(*values: Any) -> Any:

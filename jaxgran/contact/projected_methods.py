@@ -1,29 +1,33 @@
 """The projected methods: how one iterate of a contact solve follows from those before it.
 
-All of them take projected steps p ← max(0, y − τ D⁻¹(W y + b)) from a point y, with a diagonal D of ``delassus`` in
-place of the operator W, and cost one product with W each. They differ in D, in y, and in the step length τ:
+All of them take projected steps p ← max(0, y − τ D⁻¹(W y + b)) from a point y, with a diagonal D of
+``delassus`` in place of the operator W, and cost one product with W each. They differ in D, in y,
+and in the step length τ:
 
-=================  ===============  ==============================  ========================================
+=================  ===============  ==============================  ================================
 method             diagonal D       starting point y                step length τ
-=================  ===============  ==============================  ========================================
+=================  ===============  ==============================  ================================
 Jacobi             spectral bound   p                               relaxation ω
-Nesterov           spectral bound   p + k/(k+3) (p − p_before)      1; k restarts when the step turns uphill
-BarzilaiBorwein    spectral bound   p                               curvature along the last step; guarded
-=================  ===============  ==============================  ========================================
+Nesterov           spectral bound   p + k/(k+3) (p − p_before)      1; k restarts when the step
+                                                                    turns uphill
+BarzilaiBorwein    spectral bound   p                               curvature along the last step;
+                                                                    guarded
+=================  ===============  ==============================  ================================
 
-Where W ⪯ D, a Jacobi step lowers ½pᵀWp + bᵀp for every ω < 2, and Nesterov's method converges at τ = 1. With diag(W)
-neither holds (``benchmarks/stability.py``).
+Where W ⪯ D, a Jacobi step lowers ½pᵀWp + bᵀp for every ω < 2, and Nesterov's method converges at τ
+= 1. With diag(W) neither holds (``benchmarks/stability.py``).
 
-Barzilai and Borwein take τ from the last step s: sᵀDs/sᵀWs and sᵀWs/(Ws)ᵀD⁻¹(Ws) in turn, both at least 1 as W ⪯ D.
-The objective does not fall in every step, and with a projection the iterates can cycle. The safeguard needs no values
-of the objective: where the best residual has not halved over 100 steps, the method continues as Nesterov's. So either
-the residual falls at that rate, or the iteration is one that converges. This is the default: in flows it needs a fifth
-to a third fewer products than Nesterov's method alone (``benchmarks solvers``).
+Barzilai and Borwein take τ from the last step s: sᵀDs/sᵀWs and sᵀWs/(Ws)ᵀD⁻¹(Ws) in turn, both at
+  least 1 as W ⪯ D. The objective does not fall in every step, and with a projection the iterates
+  can cycle. The safeguard needs no values of the objective: where the best residual has not halved
+  over 100 steps, the method continues as Nesterov's. So either the residual falls at that rate, or
+  the iteration is one that converges. This is the default: in flows it needs a fifth to a third
+  fewer products than Nesterov's method alone (``benchmarks solvers``).
 
 A subclass of ``ProjectedMethod`` is a method too, wherever it is written.
 
-Sources: Nesterov (1983); O'Donoghue and Candès (2015) for the restart; Barzilai and Borwein (1988); Birgin, Martínez
-and Raydan (2000) for projected spectral gradients.
+Sources: Nesterov (1983); O'Donoghue and Candès (2015) for the restart; Barzilai and Borwein (1988);
+  Birgin, Martínez and Raydan (2000) for projected spectral gradients.
 """
 
 import json
@@ -56,17 +60,20 @@ class Iterate(NamedTuple):
 class ProjectedMethod:
     """Base class of the methods that solve the contacts of a step: 0 ≤ p ⟂ W p + b ≥ 0.
 
-    ==========  =====  ====  =====================================================================================
+    ==========  =====  ====  =======================================================================
     field       shape  unit  meaning
-    ==========  =====  ====  =====================================================================================
-    tolerance   ()     –     relative residual ‖min(diag(W) p, W p + b)‖ / ‖min(b, 0)‖ to reach, 1e-12 to 0.1
-    max_steps   ()     –     largest number of iterations; the best iterate is then returned, with a status
-    ==========  =====  ====  =====================================================================================
+    ==========  =====  ====  =======================================================================
+    tolerance   ()     –     relative residual ‖min(diag(W) p, W p + b)‖ / ‖min(b, 0)‖ to reach,
+                             1e-12 to 0.1
+    max_steps   ()     –     largest number of iterations; the best iterate is then returned, with a
+                             status
+    ==========  =====  ====  =======================================================================
 
-    Each iteration is a projected step p ← max(0, y − τ D⁻¹(W y + b)). A subclass says what D, y and τ are, by
-    overriding one or more of ``bound``, ``init``, ``propose`` and ``learn``. What is inherited is Jacobi's method with
-    D the spectral bound and τ = 1. A subclass is a frozen dataclass. It is a JAX pytree whose fields are traced: other
-    numbers recompile nothing. A field with ``metadata={"static": True}`` is static.
+    Each iteration is a projected step p ← max(0, y − τ D⁻¹(W y + b)). A subclass says what D, y and
+    τ are, by overriding one or more of ``bound``, ``init``, ``propose`` and ``learn``. What is
+    inherited is Jacobi's method with D the spectral bound and τ = 1. A subclass is a frozen
+    dataclass. It is a JAX pytree whose fields are traced: other numbers recompile nothing. A field
+    with ``metadata={"static": True}`` is static.
 
     Raises:
       InputError: (a ValueError) a number is outside its range; traced numbers are not checked.
@@ -92,9 +99,19 @@ class ProjectedMethod:
         _register(cls)
 
     def __post_init__(self) -> None:
-        require_number("tolerance", self.tolerance, lambda x: (x >= 1e-12) & (x <= 0.1), "between 1e-12 and 0.1")
+        require_number(
+            "tolerance",
+            self.tolerance,
+            lambda x: (x >= 1e-12) & (x <= 0.1),
+            "between 1e-12 and 0.1",
+        )
         words = "a whole number of at least 1"
-        require_number("max_steps", self.max_steps, lambda x: (x >= 1) & (x <= 2**31 - 1) & (x == np.floor(x)), words)
+        require_number(
+            "max_steps",
+            self.max_steps,
+            lambda x: (x >= 1) & (x <= 2**31 - 1) & (x == np.floor(x)),
+            words,
+        )
 
     def bound(self, contacts: Operator, grains: int) -> Float[Array, " contacts"]:
         """Diagonal D of positive numbers in place of W, see ``delassus``.
@@ -106,7 +123,9 @@ class ProjectedMethod:
         return spectral_bound(contacts, grains)
 
     def init(self, approach: Float[Array, " contacts"]) -> Any:
-        """What the method remembers between iterations, at the start: a pytree of floats; ``approach`` is b."""
+        """What the method remembers between iterations, at the start: a pytree of floats;
+        ``approach`` is b.
+        """
         return ()
 
     def propose(self, now: Iterate) -> tuple[Float[Array, "2 contacts"], float | Float[Array, ""]]:
@@ -133,7 +152,9 @@ class ProjectedMethod:
 
 
 def _register(cls: type) -> None:
-    """Make a class of methods a pytree, whose fields are read when an instance is first flattened."""
+    """Make a class of methods a pytree, whose fields are read when an instance is first
+    flattened.
+    """
 
     def names(static: bool) -> list[str]:
         return [field.name for field in fields(cls) if bool(field.metadata.get("static")) == static]
@@ -143,7 +164,9 @@ def _register(cls: type) -> None:
         return leaves, tuple(getattr(solver, name) for name in names(True))
 
     def unflatten(static: tuple, leaves: Any) -> Any:
-        solver = object.__new__(cls)  # without checks: JAX also passes axis numbers and placeholders
+        solver = object.__new__(
+            cls
+        )  # without checks: JAX also passes axis numbers and placeholders
         for name, value in zip([*names(True), *names(False)], (*static, *leaves), strict=True):
             object.__setattr__(solver, name, value)
         return solver
@@ -156,10 +179,11 @@ _register(ProjectedMethod)
 
 @dataclass(frozen=True)
 class BarzilaiBorwein(ProjectedMethod):
-    """The method of Barzilai and Borwein with a safeguard, the default; fields as ``ProjectedMethod``.
+    """The method of Barzilai and Borwein with a safeguard, the default; fields as
+    ``ProjectedMethod``.
 
-    Source: J. Barzilai and J. M. Borwein, IMA J. Numer. Anal. 8, 141 (1988); projected by E. G. Birgin,
-    J. M. Martínez and M. Raydan, SIAM J. Optim. 10, 1196 (2000).
+    Source: J. Barzilai and J. M. Borwein, IMA J. Numer. Anal. 8, 141 (1988); projected by E. G.
+      Birgin, J. M. Martínez and M. Raydan, SIAM J. Optim. 10, 1196 (2000).
 
     Examples:
       >>> BarzilaiBorwein(tolerance=1e-6)
@@ -167,14 +191,20 @@ class BarzilaiBorwein(ProjectedMethod):
     """
 
     def init(self, approach: Array) -> Any:
-        return 1.0, -1.0, float("inf")  # step length; momentum, negative until it is Nesterov's; residual a window ago
+        return (
+            1.0,
+            -1.0,
+            float("inf"),
+        )  # step length; momentum, negative until it is Nesterov's; residual a window ago
 
     def propose(self, now: Iterate) -> tuple[Array, Array]:
         stride, k, _ = now.memory
         momentum = jnp.maximum(k, 0)
         return now.point + momentum / (momentum + 3) * (now.point - now.previous), stride
 
-    def learn(self, now: Iterate, start: Array, point: Array, bound: Array, best_residual: Array) -> Any:
+    def learn(
+        self, now: Iterate, start: Array, point: Array, bound: Array, best_residual: Array
+    ) -> Any:
         _, k, last_residual = now.memory
         window_ends = now.iterations % WINDOW == WINDOW - 1
         guarded = (k >= 0) | (window_ends & ~(best_residual < PROGRESS * last_residual))
@@ -183,7 +213,8 @@ class BarzilaiBorwein(ProjectedMethod):
         along_step = is_long | guarded
         scaled_step = bound * jnp.where(guarded, start[0] - point[0], step)
         scaled = jnp.where(along_step, scaled_step, response / bound)
-        # sᵀDs of the long step or (Ws)ᵀD⁻¹Ws of the short one; the descent along the step of Nesterov's method
+        # sᵀDs of the long step or (Ws)ᵀD⁻¹Ws of the short one; the descent along the step of
+        # Nesterov's method
         square = dot(scaled, jnp.where(along_step, step, response))
         curvature = dot(step, response)  # sᵀWs
         numerator = jnp.where(is_long, square, curvature)
@@ -203,8 +234,8 @@ class BarzilaiBorwein(ProjectedMethod):
 class Nesterov(ProjectedMethod):
     """Nesterov's accelerated method with restarts; fields as ``ProjectedMethod``.
 
-    Source: Y. Nesterov, Sov. Math. Dokl. 27, 372 (1983); the restart: B. O'Donoghue and E. Candès, Found. Comput. Math.
-    15, 715 (2015).
+    Source: Y. Nesterov, Sov. Math. Dokl. 27, 372 (1983); the restart: B. O'Donoghue and E. Candès,
+      Found. Comput. Math. 15, 715 (2015).
 
     Examples:
       >>> Nesterov()
@@ -218,14 +249,17 @@ class Nesterov(ProjectedMethod):
         k = now.memory
         return now.point + k / (k + 3) * (now.point - now.previous), jnp.ones_like(k)
 
-    def learn(self, now: Iterate, start: Array, point: Array, bound: Array, best_residual: Array) -> Any:
+    def learn(
+        self, now: Iterate, start: Array, point: Array, bound: Array, best_residual: Array
+    ) -> Any:
         uphill = dot(bound * (start[0] - point[0]), point[0] - now.point[0]) > 0
         return jnp.where(uphill, 0, now.memory + 1)
 
 
 @dataclass(frozen=True)
 class Jacobi(ProjectedMethod):
-    """Projected Jacobi with the spectral bound, of relaxation ω; other fields as ``ProjectedMethod``.
+    """Projected Jacobi with the spectral bound, of relaxation ω; other fields as
+    ``ProjectedMethod``.
 
     ==========  =====  ====  =============
     field       shape  unit  meaning
@@ -247,14 +281,21 @@ class Jacobi(ProjectedMethod):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_number("relaxation", self.relaxation, lambda x: (x > 0) & (x < 2), "between 0 and 2, both excluded")
+        require_number(
+            "relaxation",
+            self.relaxation,
+            lambda x: (x > 0) & (x < 2),
+            "between 0 and 2, both excluded",
+        )
 
     def propose(self, now: Iterate) -> tuple[Array, Array]:
         return now.point, jnp.asarray(self.relaxation, now.point.dtype)
 
 
 DEFAULT_SOLVER = BarzilaiBorwein()
-SOLVERS: dict[SolverName, type[ProjectedMethod]] = {  # by their names on the command line and in files
+SOLVERS: dict[
+    SolverName, type[ProjectedMethod]
+] = {  # by their names on the command line and in files
     "barzilai-borwein": BarzilaiBorwein,
     "nesterov": Nesterov,
     "jacobi": Jacobi,
@@ -262,7 +303,8 @@ SOLVERS: dict[SolverName, type[ProjectedMethod]] = {  # by their names on the co
 
 
 def solver_name(solver: ProjectedMethod) -> str:
-    """The name of a method in files and messages; that of a user's own class says where it is defined.
+    """The name of a method in files and messages; that of a user's own class says where it is
+    defined.
 
     Examples:
       >>> solver_name(Nesterov())
@@ -302,7 +344,10 @@ def _in_json(value: Any) -> Any:
 def require_solver(solver: Any) -> None:
     """Raise an InputError unless this is a projected method."""
     if not isinstance(solver, ProjectedMethod):
-        raise InputError(f"solver must be a ProjectedMethod, such as jg.BarzilaiBorwein(), not {short_repr(solver)}.")
+        raise InputError(
+            "solver must be a ProjectedMethod, such as jg.BarzilaiBorwein(), not "
+            f"{short_repr(solver)}."
+        )
 
 
 def dot(a: Float[Array, " contacts"], b: Float[Array, " contacts"]) -> Float[Array, ""]:

@@ -1,8 +1,9 @@
 """How far impulses are from a solution of a contact problem, by the definitions in use.
 
-With w = u⁺ + α u⁻ = W p + (1 + α) u⁻ the law is 0 ≤ p ⟂ w ≥ 0. All definitions are made dimensionless by what stops
-every contact by itself: the speed v = (1 + α) ‖min(u⁻, 0)‖ and the energy E = (1 + α)² Σ min(u⁻, 0)²/W_cc. So they do
-not depend on units, and a list of problems has comparable numbers.
+With w = u⁺ + α u⁻ = W p + (1 + α) u⁻ the law is 0 ≤ p ⟂ w ≥ 0. All definitions are made
+dimensionless by what stops every contact by itself: the speed v = (1 + α) ‖min(u⁻, 0)‖ and the
+energy E = (1 + α)² Σ min(u⁻, 0)²/W_cc. So they do not depend on units, and a list of problems has
+comparable numbers.
 """
 
 from dataclasses import dataclass
@@ -27,18 +28,20 @@ from jaxgran.model.flow import RANGES
 class ContactResiduals:
     """How far impulses p are from a solution; all are zero at one, and none has a derivative.
 
-    ==================  =====  ====  ===================================================================
+    ==================  =====  ====  ===============================================================
     field               shape  unit  meaning
-    ==================  =====  ====  ===================================================================
+    ==================  =====  ====  ===============================================================
     natural_map         ()     –     ‖min(W_cc p, w)‖ / v; what ``tolerance`` is compared with
     fischer_burmeister  ()     –     ‖a + w − √(a² + w²)‖ / v with a = W_cc p
     complementarity     ()     –     largest |p w| of a contact / E
-    energy              ()     –     |p·w| / E; the energy after differs from that of the law by p·w/(1 + α)
+    energy              ()     –     |p·w| / E; the energy after differs from that of the law by
+                                     p·w/(1 + α)
     approach            ()     –     largest speed −w at which a contact still approaches / v
     tension             ()     –     largest speed −W_cc p of an impulse that pulls / v
-    ==================  =====  ====  ===================================================================
+    ==================  =====  ====  ===============================================================
 
-    w = u⁺ + α u⁻; v = (1 + α) ‖min(u⁻, 0)‖ and E = (1 + α)² Σ min(u⁻, 0)²/W_cc, or 1 where nothing approaches.
+    w = u⁺ + α u⁻; v = (1 + α) ‖min(u⁻, 0)‖ and E = (1 + α)² Σ min(u⁻, 0)²/W_cc, or 1 where nothing
+    approaches.
     """
 
     natural_map: Float[Array, ""]
@@ -51,7 +54,9 @@ class ContactResiduals:
     __eq__ = equal_values
 
 
-def contact_residuals(problem: ContactProblem, impulses: Any, restitution: float | Array = 0.0) -> ContactResiduals:
+def contact_residuals(
+    problem: ContactProblem, impulses: Any, restitution: float | Array = 0.0
+) -> ContactResiduals:
     """Residuals of impulses from any solver; ``jit`` and ``vmap`` apply.
 
     ===========  ===============================  ====  ===========================
@@ -62,11 +67,12 @@ def contact_residuals(problem: ContactProblem, impulses: Any, restitution: float
     restitution  ()                               –     α in [0, 1]
     ===========  ===============================  ====  ===========================
 
-    Sources: Fischer, Optimization 24, 269 (1992); Facchinei and Pang, Finite-Dimensional Variational Inequalities
-    (2003), chapter 1, for the natural map.
+    Sources: Fischer, Optimization 24, 269 (1992); Facchinei and Pang, Finite-Dimensional
+      Variational Inequalities (2003), chapter 1, for the natural map.
 
     Raises:
-      InputError: (a ValueError) as ``solve_contacts``, or the impulses are not one number for each contact.
+      InputError: (a ValueError) as ``solve_contacts``, or the impulses are not one number for each
+        contact.
 
     Examples:
       The impulse 1 stops two discs of mass 2 that approach at speed 1; half of it does not:
@@ -108,6 +114,8 @@ def residuals_of(problem: ContactProblem, impulses: Array, restitution: Array) -
 
 
 def _fischer_burmeister(a: Array, b: Array) -> Array:
-    """a + b − √(a² + b²), without the cancellation that hides one small number beside a large one."""
+    """a + b − √(a² + b²), without the cancellation that hides one small number beside a large
+    one.
+    """
     length, total = jnp.hypot(a, b), a + b
     return jnp.where(total > 0, 2 * a * b / jnp.where(total > 0, total + length, 1), total - length)

@@ -52,26 +52,31 @@ def solve_contacts(
 ) -> ContactSolution:
     """Impulses of a frictionless contact problem: 0 ≤ p ⟂ u⁺ + α u⁻ ≥ 0 with u⁺ = u⁻ + W p.
 
-    ===========  ===============================  =====================================================================
+    ===========  ===============================  ==================================================
     argument     type or shape                    meaning
-    ===========  ===============================  =====================================================================
+    ===========  ===============================  ==================================================
     problem      ContactNetwork, DelassusProblem  the contacts, or W and u⁻
-    restitution  ()                               α in [0, 1], Newton's: u⁺ = −α u⁻ where an impulse acts
-    solver       ProjectedMethod                  the method, and the residual of the natural map to reach
-    ===========  ===============================  =====================================================================
+    restitution  ()                               α in [0, 1], Newton's: u⁺ = −α u⁻ where an impulse
+                                                  acts
+    solver       ProjectedMethod                  the method, and the residual of the natural map to
+                                                  reach
+    ===========  ===============================  ==================================================
 
-    ``jit``, ``vmap`` and derivatives of impulses and velocities apply, in forward and in reverse mode. They are those
-    of the solution, not of the iteration, and want a tolerance of 1e-8 or less. Where impulses are not unique, as in a
-    cluster with more contacts than degrees of freedom, velocities are, and one solution is returned.
+    ``jit``, ``vmap`` and derivatives of impulses and velocities apply, in forward and in reverse
+    mode. They are those of the solution, not of the iteration, and want a tolerance of 1e-8 or
+    less. Where impulses are not unique, as in a cluster with more contacts than degrees of freedom,
+    velocities are, and one solution is returned.
 
-    With one α for all contacts no solution gains energy: it changes by −½ (1 − α²) p₀ᵀ W p₀, where p₀ is the solution
-    at α = 0. A tolerance below the rounding of the velocities is met at 10 roundings of the largest |u⁻|.
+    With one α for all contacts no solution gains energy: it changes by −½ (1 − α²) p₀ᵀ W p₀, where
+      p₀ is the solution at α = 0. A tolerance below the rounding of the velocities is met at 10
+      roundings of the largest |u⁻|.
 
     Raises:
-      InputError: (a ValueError) a number is outside its range; a problem is empty, its shapes do not fit, or its
-        values are not finite; a normal is no unit vector or a grain does not exist; a matrix is not symmetric, or has
-        a negative eigenvalue or no positive diagonal (above 2048 contacts, eigenvalues are judged by the 2×2 minors
-        alone). Values that JAX traces are not checked, and end in a status.
+      InputError: (a ValueError) a number is outside its range; a problem is empty, its shapes do
+        not fit, or its values are not finite; a normal is no unit vector or a grain does not exist;
+        a matrix is not symmetric, or has a negative eigenvalue or no positive diagonal (above 2048
+        contacts, eigenvalues are judged by the 2×2 minors alone). Values that JAX traces are not
+        checked, and end in a status.
 
     Examples:
       Three equal discs in a row, the first of which is hit; all impulses of the row act together:
@@ -87,16 +92,22 @@ def solve_contacts(
     require_number("restitution", restitution, *RANGES["restitution"])
     require_solver(solver)
     kind: Any = problem.approach.dtype
-    return _solved(problem, jnp.asarray(restitution, kind), jax.tree.map(partial(_of_precision, kind), solver))
+    return _solved(
+        problem, jnp.asarray(restitution, kind), jax.tree.map(partial(_of_precision, kind), solver)
+    )
 
 
 def _of_precision(kind: Any, number: Any) -> Array:
     """A number of the solver in the precision of the problem; whole numbers stay whole."""
-    return jnp.asarray(number, kind if jnp.issubdtype(jnp.result_type(number), jnp.floating) else jnp.int32)
+    return jnp.asarray(
+        number, kind if jnp.issubdtype(jnp.result_type(number), jnp.floating) else jnp.int32
+    )
 
 
 @jax.jit
-def _solved(problem: ContactProblem, restitution: Array, solver: ProjectedMethod) -> ContactSolution:
+def _solved(
+    problem: ContactProblem, restitution: Array, solver: ProjectedMethod
+) -> ContactSolution:
     network = isinstance(problem, ContactNetwork)
     operator = as_contacts(problem) if network else problem
     grains = problem.masses.size if network else 0

@@ -4,17 +4,20 @@ With normal impulses p and the Delassus operator W = H M⁻¹ Hᵀ the contact l
 
     u⁺ = u⁻ + W p,    0 ≤ p ⟂ u⁺ + α u⁻ ≥ 0.
 
-Its solution is p = (1 + α) p₀, where p₀ solves it at α = 0; so only 0 ≤ p₀ ⟂ W p₀ + u⁻ ≥ 0 is ever solved.
+Its solution is p = (1 + α) p₀, where p₀ solves it at α = 0; so only 0 ≤ p₀ ⟂ W p₀ + u⁻ ≥ 0 is ever
+solved.
 
-Derivatives do not go through the iteration. On the contacts that press, A = {p₀ > 0}, the solution satisfies
-W_AA p₀ + u⁻_A = 0, and every small change keeps it so where no contact is about to press or to part:
+Derivatives do not go through the iteration. On the contacts that press, A = {p₀ > 0}, the solution
+satisfies W_AA p₀ + u⁻_A = 0, and every small change keeps it so where no contact is about to press
+or to part:
 
     W_AA dp₀ = −(dW p₀ + du⁻)_A,    dp₀ = 0 elsewhere.
 
-This linear system is solved by conjugate gradients, in forward and in reverse mode, whose memory does not depend on the
-iterations. Where W_AA is singular, as in a cluster with more contacts than degrees of freedom, velocities after the
-step have this derivative and the impulses are not unique, nor are their derivatives: one solution is returned. The
-set A is that of the solution found, so derivatives want a small tolerance (1e-8 or less).
+This linear system is solved by conjugate gradients, in forward and in reverse mode, whose memory
+does not depend on the iterations. Where W_AA is singular, as in a cluster with more contacts than
+degrees of freedom, velocities after the step have this derivative and the impulses are not unique,
+nor are their derivatives: one solution is returned. The set A is that of the solution found, so
+derivatives want a small tolerance (1e-8 or less).
 """
 
 from dataclasses import dataclass
@@ -35,7 +38,10 @@ from jaxgran.contact.projected_methods import Iterate, ProjectedMethod, dot
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.status import Status
 
-_DERIVATIVE_TOLERANCE, _WORST_DERIVATIVE = 1e-12, 1e-6  # relative residuals; a derivative above the latter is NaN
+_DERIVATIVE_TOLERANCE, _WORST_DERIVATIVE = (
+    1e-12,
+    1e-6,
+)  # relative residuals; a derivative above the latter is NaN
 _DERIVATIVE_ITERATIONS = 50  # at most, for each slot of a contact
 
 
@@ -53,7 +59,11 @@ class Solution:
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def solve(
-    contacts: Operator, grains: int, shear_rate: float | Array, solver: ProjectedMethod, active: Array
+    contacts: Operator,
+    grains: int,
+    shear_rate: float | Array,
+    solver: ProjectedMethod,
+    active: Array,
 ) -> Solution:
     """Impulses p₀ of the network at restitution zero: 0 ≤ p₀ ⟂ W p₀ + u⁻ ≥ 0.
 
@@ -64,13 +74,17 @@ def solve(
       solver: the projected method, with its tolerance and its largest number of iterations.
       active: whether this replica has something to solve; others of its batch return zero impulses.
 
-    Impulses and response have derivatives with respect to the network, see the module; all else has none.
+    Impulses and response have derivatives with respect to the network, see the module; all else has
+    none.
     """
     b, w_diagonal = contacts.approach, diagonal(contacts, grains)
     bound = solver.bound(contacts, grains)
     closing = jnp.minimum(b, 0)
     scale = jnp.sqrt(dot(closing, closing))
-    tolerance, max_steps = jnp.asarray(solver.tolerance, b.dtype), jnp.asarray(solver.max_steps, jnp.int32)
+    tolerance, max_steps = (
+        jnp.asarray(solver.tolerance, b.dtype),
+        jnp.asarray(solver.max_steps, jnp.int32),
+    )
     target = residual_target(scale, tolerance, shear_rate, jnp.finfo(b.dtype).eps)
 
     def as_numbers(values: Any) -> Any:
@@ -99,23 +113,31 @@ def solve(
     zero, infinite = jnp.zeros((2, b.size), b.dtype), jnp.asarray(jnp.inf, b.dtype)
     start = Iterate(zero, zero, as_numbers(solver.init(b)), infinite, jnp.int32(0))
     end = lax.while_loop(
-        lambda now: any_replica(now.unfinished), iterate, _Progress(start, infinite, zero, jnp.asarray(active))
+        lambda now: any_replica(now.unfinished),
+        iterate,
+        _Progress(start, infinite, zero, jnp.asarray(active)),
     )
     impulses, response = end.best
 
     def is_jammed():
-        last, moved = end.at.point  # the best iterate may be an early one, whose impulses have not grown yet
+        last, moved = (
+            end.at.point
+        )  # the best iterate may be an early one, whose impulses have not grown yet
         return dot(last, moved) < JAMMED_RESPONSE * -dot(b, last)
 
     capped = active & ~(end.residual <= target)
     jammed = lax.cond(any_replica(capped), is_jammed, lambda: jnp.bool_(False))
-    status = jnp.where(capped, jnp.where(jammed, Status.infeasible, Status.iteration_limit), Status.ok)
+    status = jnp.where(
+        capped, jnp.where(jammed, Status.infeasible, Status.iteration_limit), Status.ok
+    )
     return Solution(
         impulses=impulses,
         response=response,
         residual=jnp.where(active, relative_residual(end.at.best_residual, scale, target), 0),
         iterations=end.at.iterations,
-        status=jnp.where(active & ~jnp.isfinite(end.at.best_residual), Status.nonfinite, status).astype(jnp.int32),
+        status=jnp.where(
+            active & ~jnp.isfinite(end.at.best_residual), Status.nonfinite, status
+        ).astype(jnp.int32),
     )
 
 
@@ -144,7 +166,9 @@ def _solve_jvp(grains: int, primals: tuple, tangents: tuple) -> tuple[Solution, 
         return jnp.where(good, change, jnp.nan)
 
     change = tangents[0]
-    _, response_change = jax.jvp(lambda operator: delassus_product(operator, impulses, grains), (contacts,), (change,))
+    _, response_change = jax.jvp(
+        lambda operator: delassus_product(operator, impulses, grains), (contacts,), (change,)
+    )
     wanted = jnp.where(loaded, -(response_change + change.approach), 0)
     impulse_change = lax.custom_linear_solve(loaded_product, wanted, solved, symmetric=True)
     none: Any = np.zeros((), jax.dtypes.float0)
@@ -162,7 +186,9 @@ def single_contact(network: Contacts, grains: int) -> Solution:
     w_diagonal = diagonal(network, grains)
     impulses = jnp.maximum(0, -network.approach / w_diagonal)
     status = jnp.where(jnp.any(jnp.isnan(impulses)), Status.nonfinite, Status.ok).astype(jnp.int32)
-    return Solution(impulses, w_diagonal * impulses, jnp.zeros((), impulses.dtype), jnp.int32(1), status)
+    return Solution(
+        impulses, w_diagonal * impulses, jnp.zeros((), impulses.dtype), jnp.int32(1), status
+    )
 
 
 class _Progress(NamedTuple):

@@ -1,7 +1,7 @@
 """Advances one replica through time, with the engine that ``dynamics.engine`` selects.
 
-XLA calls the numba engine through its foreign function interface, so ``jit``, ``lax.map`` and ``vmap`` apply to both
-engines.
+XLA calls the numba engine through its foreign function interface, so ``jit``, ``lax.map`` and
+``vmap`` apply to both engines.
 """
 
 from collections.abc import Callable
@@ -36,57 +36,75 @@ def advance(
     solver: ProjectedMethod = DEFAULT_SOLVER,
     engine: Engine | None = None,
 ) -> tuple[State, Tally]:
-    """Advance a flow, or a batch of flows, by a number of time steps; ``jit``, ``vmap`` and ``lax.map`` apply.
+    """Advance a flow, or a batch of flows, by a number of time steps; ``jit``, ``vmap`` and
+    ``lax.map`` apply.
 
     A batch is a flow or a state whose arrays have a leading (replicas,) axis, as in ``sample``.
 
-    Without an ``engine``, ``Numba`` is taken on a processor, if the solver is a ``BarzilaiBorwein`` and
-    ``free_flight``, ``events`` and ``moving_contacts`` are left out; otherwise ``Jax``. Both engines solve the same
-    steps to the same tolerance, and differ by rounding and within the tolerance only; on a processor ``Numba`` is
-    several times faster. Under ``vmap`` without ``events``, replicas take a processor in turn by ``Jax``, on all cores
-    by ``Numba``, and an accelerator in lockstep, with the same bits as alone. This function does not compile itself:
+    Without an ``engine``, ``Numba`` is taken on a processor, if the solver is a ``BarzilaiBorwein``
+    and ``free_flight``, ``events`` and ``moving_contacts`` are left out; otherwise ``Jax``. Both
+    engines solve the same steps to the same tolerance, and differ by rounding and within the
+    tolerance only; on a processor ``Numba`` is several times faster. Under ``vmap`` without
+    ``events``, replicas take a processor in turn by ``Jax``, on all cores by ``Numba``, and an
+    accelerator in lockstep, with the same bits as alone. This function does not compile itself:
     call it within ``jax.jit``.
 
-    Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) need no further argument. Reverse-mode derivatives
-    (``jax.grad``, ``jax.vjp``) need the number of ``events``. Reverse mode stores the state and the lists of every
-    event, about 0.6 kB a grain. It computes contacts and impulses again in the backward pass.
+    Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) need no further argument. Reverse-mode
+    derivatives (``jax.grad``, ``jax.vjp``) need the number of ``events``. Reverse mode stores the
+    state and the lists of every event, about 0.6 kB a grain. It computes contacts and impulses
+    again in the backward pass.
 
     Args:
       flow: parameters of the state; or those (replicas,) of a batch.
       state: the flow at the beginning; or a batch of states.
       steps: number of time steps, traced; for a batch also (replicas,).
-      free_flight: True jumps over steps without an approaching contact; False visits every step. The trajectory is the
-        same.
-      events: number of visited steps, static, for a loop of fixed length; ``2 * steps + 1`` is always enough, and
-        ``count_events`` counts them. If they are too few, the status is ``capacity``, and numbers and derivatives are
-        NaN. None visits as many as needed.
+      free_flight: True jumps over steps without an approaching contact; False visits every step.
+        The trajectory is the same.
+      events: number of visited steps, static, for a loop of fixed length; ``2 * steps + 1`` is
+        always enough, and ``count_events`` counts them. If they are too few, the status is
+        ``capacity``, and numbers and derivatives are NaN. None visits as many as needed.
       moving_contacts: whether derivatives include the shift of the contacts in time, see
         ``dynamics.jax_engine``. Values do not change.
       solver: solves the contacts of each step. New numbers in it do not recompile.
       engine: ``Jax()`` or ``Numba()``; None for an automatic choice, see ``dynamics.engine``.
 
     Returns:
-      The state after the last step, and the tally of the steps, with a leading (replicas,) axis for a batch. A replica
-      with a number that is not finite stops with the status ``nonfinite``.
+      The state after the last step, and the tally of the steps, with a leading (replicas,) axis for
+      a batch. A replica with a number that is not finite stops with the status ``nonfinite``.
 
     Raises:
       InputError: the axes of a batch differ, or the engine cannot do this.
       NotImplementedError: by JAX, where a derivative in reverse mode lacks ``events``.
     """
     numerics = checked_numerics(solver, engine)
-    options = {"free_flight=False": not free_flight, "events": events is not None, "moving_contacts": moving_contacts}
+    options = {
+        "free_flight=False": not free_flight,
+        "events": events is not None,
+        "moving_contacts": moving_contacts,
+    }
     option = " and ".join(name for name, given in options.items() if given)
     if batch := checked_batch(require_advance, flow, state, steps):
 
         def advance_one(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-            return advance(flow, state, steps, free_flight, events, moving_contacts, solver=solver, engine=engine)
+            return advance(
+                flow,
+                state,
+                steps,
+                free_flight,
+                events,
+                moving_contacts,
+                solver=solver,
+                engine=engine,
+            )
 
         return over_replicas(advance_one, numerics, batch, option)
     selected = select_engine(flow, numerics, state, option)
     if isinstance(selected, Numba):
         return _numba_engine(flow, numerics.solver, state, steps)
     if events is not None or in_batch():
-        return advance_by_jax(flow, numerics.solver, state, steps, free_flight, events, moving_contacts)
+        return advance_by_jax(
+            flow, numerics.solver, state, steps, free_flight, events, moving_contacts
+        )
     arrays = jax.tree.map(jnp.asarray, (flow, numerics.solver, state, steps, free_flight))
     return _jax_engine(moving_contacts)(*arrays)
 
@@ -96,9 +114,9 @@ def advance_blocks(
 ) -> tuple[State, Tally]:
     """Advance a flow by one block of steps after another, with a tally (blocks,) for each.
 
-    The engine ``Jax`` advances by each block as ``advance`` does. The numba engine keeps its list of near pairs from
-    one block to the next, so its trajectory differs by rounding from that of one call a block, and a batch of replicas
-    meets at the end of all blocks only.
+    The engine ``Jax`` advances by each block as ``advance`` does. The numba engine keeps its list
+    of near pairs from one block to the next, so its trajectory differs by rounding from that of one
+    call a block, and a batch of replicas meets at the end of all blocks only.
     """
     if isinstance(select_engine(flow, numerics, state), Numba):
         return _numba_blocks(flow, numerics.solver, state, steps)
@@ -111,10 +129,16 @@ def advance_blocks(
 
 @cache
 def _jax_engine(moving_contacts: bool) -> Callable[..., tuple[State, Tally]]:
-    """The engine ``Jax`` with batches and forward derivatives; reverse mode needs ``events``, and the plain engine."""
+    """The engine ``Jax`` with batches and forward derivatives; reverse mode needs ``events``, and
+    the plain engine.
+    """
 
-    def engine(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array, free_flight: Array):
-        return advance_by_jax(flow, solver, state, steps, free_flight, moving_contacts=moving_contacts)
+    def engine(
+        flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array, free_flight: Array
+    ):
+        return advance_by_jax(
+            flow, solver, state, steps, free_flight, moving_contacts=moving_contacts
+        )
 
     def of_replica(arguments: tuple) -> tuple[State, Tally]:
         return engine(*arguments)
@@ -130,12 +154,16 @@ def register_numba() -> None:
     ffi.register()
 
 
-def _advance_by_numba(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
+def _advance_by_numba(
+    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
+) -> tuple[State, Tally]:
     """Advance one replica with the numba engine."""
     return _end_of(state, call_numba(flow, solver, state, steps[None]))
 
 
-def _blocks_by_numba(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
+def _blocks_by_numba(
+    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
+) -> tuple[State, Tally]:
     """Advance one replica with the numba engine, by blocks of steps."""
     call = call_numba(flow, solver, state, steps)
     energies = jnp.concatenate([kinetic_energy(state.grains, state.velocities)[None], call.kinetic])
@@ -147,13 +175,17 @@ def _blocks_by_numba(flow: ShearFlow, solver: ProjectedMethod, state: State, ste
     return end, jax.tree.map(lambda all_blocks, x: all_blocks.at[-1].set(x), tallies, last)
 
 
-def _blocks_by_jax(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
+def _blocks_by_jax(
+    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
+) -> tuple[State, Tally]:
     """The same with the engine ``Jax``."""
     return lax.scan(lambda state, steps: advance_by_jax(flow, solver, state, steps), state, steps)
 
 
 def _end_of(state: State, call: "NumbaCall") -> tuple[State, Tally]:
-    """The state at the end of a call from a state, and the tally of its last block, with the whole energy change."""
+    """The state at the end of a call from a state, and the tally of its last block, with the whole
+    energy change.
+    """
     sums = jax.tree.map(lambda x: x[-1], call.sums)
     return ended(state, call.end.positions, call.end.tilt, call.end.velocities, sums)
 
@@ -161,18 +193,20 @@ def _end_of(state: State, call: "NumbaCall") -> tuple[State, Tally]:
 class NumbaCall(NamedTuple):
     """What a call of the numba engine returns.
 
-    =========  ===============  ==========================================================================
+    =========  ===============  ====================================================================
     field      shape            meaning
-    =========  ===============  ==========================================================================
+    =========  ===============  ====================================================================
     end        State            the state at the end, unless the call is suspended
-    sums       RunningSums      (blocks,) the running sums, with those of the calls that it goes on from
+    sums       RunningSums      (blocks,) the running sums, with those of the calls that it goes on
+                                from
     kinetic    (blocks,)        kinetic energy at the end of each block but the last one
     drift      (blocks,)        relative momentum then
     suspended  ()               where the call is suspended; 0 if it is finished
     recorded   ()               number of records
     records    (room, numbers)  see ``numba_engine.records``
-    memory     (words,)         memory of the engine, in which another call goes on; (0,) without records
-    =========  ===============  ==========================================================================
+    memory     (words,)         memory of the engine, in which another call goes on; (0,) without
+                                records
+    =========  ===============  ====================================================================
     """
 
     end: State
@@ -189,7 +223,9 @@ def numba_memory(flow: ShearFlow) -> jax.ShapeDtypeStruct:
     """The memory of the numba engine for one replica."""
     from jaxgran.dynamics.numba_engine import layout
 
-    return jax.ShapeDtypeStruct((1 + layout.WORDS + layout.WORDS_PER_GRAIN * flow.grains,), jnp.float64)
+    return jax.ShapeDtypeStruct(
+        (1 + layout.WORDS + layout.WORDS_PER_GRAIN * flow.grains,), jnp.float64
+    )
 
 
 _numba_engine = with_forward_derivative(_advance_by_numba, advance_by_jax)
@@ -210,26 +246,51 @@ def call_numba(
     Args:
       flow, solver, state: as in ``advance``.
       steps: (blocks,) numbers of time steps.
-      room: number of records, static, for one block. The call is suspended where there is no room for more; 0 records
-        nothing.
-      suspended, memory: those of an earlier call with the same arguments, where it is to go on; 0 to begin.
+      room: number of records, static, for one block. The call is suspended where there is no room
+        for more; 0 records nothing.
+      suspended, memory: those of an earlier call with the same arguments, where it is to go on; 0
+        to begin.
     """
     from jaxgran.dynamics.numba_engine import layout
     from jaxgran.dynamics.numba_engine.ffi import TARGET
 
     register_numba()
     dtype, grains, count = state.positions.dtype, state.grains, flow.grains
-    numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, solver.tolerance)
+    numbers = (
+        state.side,
+        state.tilt,
+        flow.restitution,
+        flow.timestep,
+        flow.shear_rate,
+        solver.tolerance,
+    )
     numbers = (*numbers, flow.activation_fraction, solver.max_steps, suspended)
     record = layout.record_numbers(count)
     kept = numba_memory(flow).shape if room > 0 else (0,)  # without records nothing goes on in it
-    shapes = [state.positions.shape, state.positions.shape, (*steps.shape, layout.RESULTS), kept, (room, record)]
+    shapes = [
+        state.positions.shape,
+        state.positions.shape,
+        (*steps.shape, layout.RESULTS),
+        kept,
+        (room, record),
+    ]
     results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
     aliases = None if memory is None else {6: 3}
-    call = jax.ffi.ffi_call(TARGET, results, vmap_method="broadcast_all", input_output_aliases=aliases)
+    call = jax.ffi.ffi_call(
+        TARGET, results, vmap_method="broadcast_all", input_output_aliases=aliases
+    )
     packed = jnp.stack([jnp.asarray(x).astype(dtype) for x in numbers])
-    given = state.positions, state.velocities, grains.radii, grains.masses, packed, steps.astype(dtype)
-    positions, velocities, found, memory, records = call(*given, *(() if memory is None else (memory,)))
+    given = (
+        state.positions,
+        state.velocities,
+        grains.radii,
+        grains.masses,
+        packed,
+        steps.astype(dtype),
+    )
+    positions, velocities, found, memory, records = call(
+        *given, *(() if memory is None else (memory,))
+    )
     last = found[-1]
     end = State(grains, positions, velocities, state.side, last[layout.TILT])
     sums = jax.vmap(sums_from_row)(found[:, :NUMBERS], found[:, layout.STATUS].astype(jnp.int32))

@@ -1,8 +1,9 @@
 """The rule by which ``jax.vmap`` batches the engine ``Jax``, and its forward derivative.
 
-Under the usual rule every condition becomes a ``select`` that computes both branches, for all replicas and steps. Here
-replicas advance one after another on a processor, with real conditions and loops; on an accelerator they advance in
-lockstep under an axis of our own, over which predicates are reduced (``model.control_flow``).
+Under the usual rule every condition becomes a ``select`` that computes both branches, for all
+replicas and steps. Here replicas advance one after another on a processor, with real conditions and
+loops; on an accelerator they advance in lockstep under an axis of our own, over which predicates
+are reduced (``model.control_flow``).
 """
 
 from collections.abc import Callable
@@ -23,8 +24,8 @@ T = TypeVar("T")
 def with_own_batching(function: Callable[..., T]) -> Callable[..., T]:
     """A function of pytrees of arrays for one replica, which ``vmap`` batches by the rule above.
 
-    Where the first argument is the same for all replicas, so are all conditions, and the usual rule is taken: as where
-    ``jax.jacfwd`` follows many tangents of one flow.
+    Where the first argument is the same for all replicas, so are all conditions, and the usual rule
+    is taken: as where ``jax.jacfwd`` follows many tangents of one flow.
     """
     one = custom_vmap(function)
     together = custom_vmap(lambda *batch: jax.vmap(function, axis_name=AXIS)(*batch))
@@ -35,7 +36,9 @@ def with_own_batching(function: Callable[..., T]) -> Callable[..., T]:
             axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
             return _all_batched(jax.vmap(function, axes)(*arguments))
         batch = _with_axis(size, batched, arguments)
-        return _all_batched(together(*batch) if in_lockstep() else lax.map(lambda replica: one(*replica), batch))
+        return _all_batched(
+            together(*batch) if in_lockstep() else lax.map(lambda replica: one(*replica), batch)
+        )
 
     @together.def_vmap
     def of_batches(size: int, batched: Any, *arguments: Any) -> tuple[T, Any]:
@@ -46,8 +49,12 @@ def with_own_batching(function: Callable[..., T]) -> Callable[..., T]:
     return one
 
 
-def with_forward_derivative(engine: Callable[..., T], differentiable: Callable[..., T]) -> Callable[..., T]:
-    """An engine whose derivatives in forward mode are those of a function of the same arguments, batched as above."""
+def with_forward_derivative(
+    engine: Callable[..., T], differentiable: Callable[..., T]
+) -> Callable[..., T]:
+    """An engine whose derivatives in forward mode are those of a function of the same arguments,
+    batched as above.
+    """
 
     def derivative(primals: tuple, tangents: list[jax.Array]) -> list[jax.Array]:
         return _of_real_numbers(*jax.jvp(differentiable, primals, _completed(primals, tangents)))
@@ -66,7 +73,9 @@ def with_forward_derivative(engine: Callable[..., T], differentiable: Callable[.
 def _of_real_numbers(values: Any, tangents: Any) -> list[jax.Array]:
     """The tangents of real numbers; whole numbers have none."""
     pairs = zip(jax.tree.leaves(values), jax.tree.leaves(tangents), strict=True)
-    return [tangent for value, tangent in pairs if jnp.issubdtype(jnp.result_type(value), jnp.inexact)]
+    return [
+        tangent for value, tangent in pairs if jnp.issubdtype(jnp.result_type(value), jnp.inexact)
+    ]
 
 
 def _completed(values: T, tangents: list[jax.Array]) -> T:
@@ -75,7 +84,9 @@ def _completed(values: T, tangents: list[jax.Array]) -> T:
     rest = iter(tangents)
     real = [jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x in leaves]
     zeros = [np.zeros(jnp.shape(x), jax.dtypes.float0) for x in leaves]
-    return structure.unflatten([next(rest) if is_real else zero for is_real, zero in zip(real, zeros, strict=True)])
+    return structure.unflatten(
+        [next(rest) if is_real else zero for is_real, zero in zip(real, zeros, strict=True)]
+    )
 
 
 def _with_axis(size: int, batched: Any, arguments: tuple) -> tuple:

@@ -1,8 +1,9 @@
-"""The engines that advance a flow, and the choice of one for the device, precision, solver and options.
+"""The engines that advance a flow, and the choice of one for the device, precision, solver and
+options.
 
-Both engines solve the same steps to the same tolerance, and differ in speed and rounding. ``LIMITS`` is the table of
-what each can do. Where no engine is given, ``Numba`` is taken if it can do what is asked for, and otherwise ``Jax``.
-A given engine that cannot raises an InputError.
+Both engines solve the same steps to the same tolerance, and differ in speed and rounding.
+``LIMITS`` is the table of what each can do. Where no engine is given, ``Numba`` is taken if it can
+do what is asked for, and otherwise ``Jax``. A given engine that cannot raises an InputError.
 """
 
 import warnings
@@ -24,7 +25,8 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
 _SINGLE_PRECISION = (
-    "JAX computes in single precision, in which flows take the engine jax, several times slower than the numba engine: "
+    "JAX computes in single precision, in which flows take the engine jax, several times slower "
+    "than the numba engine: "
     'begin with jax.config.update("jax_enable_x64", True).'
 )
 
@@ -33,7 +35,8 @@ _SINGLE_PRECISION = (
 class Jax:
     """The engine in JAX: every backend, precision and solver, and derivatives.
 
-    The replicas of a batch advance one after another on a processor, and in lockstep on an accelerator.
+    The replicas of a batch advance one after another on a processor, and in lockstep on an
+    accelerator.
 
     Examples:
       >>> Jax()
@@ -45,11 +48,13 @@ class Jax:
 
 @dataclass(frozen=True)
 class Numba:
-    """The engine for processors, compiled by numba: float64 and the solver ``BarzilaiBorwein`` only.
+    """The engine for processors, compiled by numba: float64 and the solver ``BarzilaiBorwein``
+    only.
 
-    It solves clusters one by one, by Gauss–Seidel sweeps and then by the method of the solver, to its ``tolerance`` and
-    within its ``max_steps``. Under ``jax.vmap`` replicas advance on all cores, with the same bits on any number of
-    threads; the environment variable ``NUMBA_NUM_THREADS`` sets their number. ``jax.lax.map`` takes one at a time.
+    It solves clusters one by one, by Gauss–Seidel sweeps and then by the method of the solver, to
+    its ``tolerance`` and within its ``max_steps``. Under ``jax.vmap`` replicas advance on all
+    cores, with the same bits on any number of threads; the environment variable
+    ``NUMBA_NUM_THREADS`` sets their number. ``jax.lax.map`` takes one at a time.
 
     Examples:
       >>> Numba()
@@ -90,7 +95,10 @@ def engine_named(name: str) -> Engine | None:
       >>> engine_named("numba"), engine_named("auto")
       (Numba(), None)
     """
-    engines: dict[str, Engine | None] = {"auto": None, **{kind.name: kind() for kind in (Jax, Numba)}}
+    engines: dict[str, Engine | None] = {
+        "auto": None,
+        **{kind.name: kind() for kind in (Jax, Numba)},
+    }
     if str(name) not in engines:
         raise InputError(f"engine must be {', '.join(engines)}, not {short_repr(name)}.")
     return engines[str(name)]
@@ -99,7 +107,9 @@ def engine_named(name: str) -> Engine | None:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Numerics:
-    """How a flow is computed, as one value: the solver of its contacts, and the engine, None for automatic."""
+    """How a flow is computed, as one value: the solver of its contacts, and the engine, None for
+    automatic.
+    """
 
     solver: ProjectedMethod = DEFAULT_SOLVER
     engine: Engine | None = field(default=None, metadata={"static": True})
@@ -109,14 +119,18 @@ DEFAULT_NUMERICS = Numerics()
 
 
 def checked_numerics(solver: Any, engine: Any) -> Numerics:
-    """Solver and engine as one value; InputError unless they are a projected method, and an engine or None."""
+    """Solver and engine as one value; InputError unless they are a projected method, and an engine
+    or None.
+    """
     require_solver(solver)
     if engine is not None and not isinstance(engine, Engine):
         raise InputError(f"engine must be jg.Jax(), jg.Numba() or None, not {short_repr(engine)}.")
     return Numerics(solver, engine)
 
 
-def select_engine(flow: ShearFlow, numerics: Numerics, state: State | None = None, option: str = "") -> Engine:
+def select_engine(
+    flow: ShearFlow, numerics: Numerics, state: State | None = None, option: str = ""
+) -> Engine:
     """The engine that was asked for, or else the first of ``LIMITS`` that can advance a flow.
 
     Args:
@@ -148,12 +162,14 @@ def select_engine(flow: ShearFlow, numerics: Numerics, state: State | None = Non
     runs = ", ".join(words.format(values) for words, values in zip(_WORDS, accepted, strict=True))
     hint = ' (jax.config.update("jax_enable_x64", True))' if "precision" in unmet else ""
     raise InputError(
-        f"engine must be jax or chosen automatically {wrong}, not {engine.name}: it runs {runs} only{hint}."
+        f"engine must be jax or chosen automatically {wrong}, not {engine.name}: it runs {runs} "
+        f"only{hint}."
     )
 
 
 def in_lockstep() -> bool:
-    """Whether the replicas of a batch advance together, as one array program that waits for its slowest replica.
+    """Whether the replicas of a batch advance together, as one array program that waits for its
+    slowest replica.
 
     They do on an accelerator. On a processor they advance one after another, which is faster.
     """
@@ -161,7 +177,8 @@ def in_lockstep() -> bool:
 
 
 def solver_in_use(engine: Engine, solver: ProjectedMethod) -> str:
-    """Name of the method that solves the contacts in an engine; isolated pairs have a closed form in both.
+    """Name of the method that solves the contacts in an engine; isolated pairs have a closed form
+    in both.
 
     Examples:
       >>> solver_in_use(Jax(), DEFAULT_SOLVER), solver_in_use(Numba(), DEFAULT_SOLVER)

@@ -1,4 +1,6 @@
-"""Ctrl-C while compiled code runs: the wait for its results ends at once, and the numba engine stops."""
+"""Ctrl-C while compiled code runs: the wait for its results ends at once, and the numba engine
+stops.
+"""
 
 import sys
 import time
@@ -16,8 +18,9 @@ T = TypeVar("T")
 def waited(results: T) -> T:
     """The results when they are computed.
 
-    A KeyboardInterrupt, as by Ctrl-C, stops every run of the numba engine in this process within one step. The engine
-    ``Jax`` cannot be stopped: it finishes in the background, and its results are discarded.
+    A KeyboardInterrupt, as by Ctrl-C, stops every run of the numba engine in this process within
+    one step. The engine ``Jax`` cannot be stopped: it finishes in the background, and its results
+    are discarded.
     """
     try:
         return jax.block_until_ready(results)
@@ -29,7 +32,9 @@ def waited(results: T) -> T:
 
 @contextmanager
 def engines_stopped() -> Iterator[None]:
-    """Within this block every running call of the numba engine in this process ends, with the status ``failed``."""
+    """Within this block every running call of the numba engine in this process ends, with the
+    status ``failed``.
+    """
     if _FFI not in sys.modules:
         yield
         return

@@ -1,15 +1,18 @@
-"""The engine ``Jax``: one replica through time in JAX, on every backend, with every solver, and with derivatives.
+"""The engine ``Jax``: one replica through time in JAX, on every backend, with every solver, and
+with derivatives.
 
-A time step finds the contacts at its beginning, changes the velocities by the impulses of the contact network, and
-flies freely for dt. Between contacts the velocity in the laboratory frame is constant, so separations are linear
-in time, and the step in which some pair next becomes an approaching contact is known in advance. The loop jumps
-there in one evaluation. The trajectory is that of the fixed time step; the cost follows the contacts.
+A time step finds the contacts at its beginning, changes the velocities by the impulses of the
+contact network, and flies freely for dt. Between contacts the velocity in the laboratory frame is
+constant, so separations are linear in time, and the step in which some pair next becomes an
+approaching contact is known in advance. The loop jumps there in one evaluation. The trajectory is
+that of the fixed time step; the cost follows the contacts.
 
-Derivatives of a trajectory hold the time steps of its contacts: the numbers of steps flown are whole and do not change.
-That is the derivative of what is computed. It is not that of the flow in the limit dt → 0, in which a contact comes
-earlier or later where the grains before it are moved. With ``moving_contacts`` every contact that begins in a step adds
-what a shift of its time by dτ does, to first order, with the values as they are. This is exact for collisions of two
-grains. Where a grain strikes a cluster, only the impulse that its own approach accounts for moves in time.
+Derivatives of a trajectory hold the time steps of its contacts: the numbers of steps flown are
+whole and do not change. That is the derivative of what is computed. It is not that of the flow in
+the limit dt → 0, in which a contact comes earlier or later where the grains before it are moved.
+With ``moving_contacts`` every contact that begins in a step adds what a shift of its time by dτ
+does, to first order, with the values as they are. This is exact for collisions of two grains. Where
+a grain strikes a cluster, only the impulse that its own approach accounts for moves in time.
 """
 
 from dataclasses import replace
@@ -56,7 +59,9 @@ def require_advance(flow: ShearFlow, state: State, steps: Any) -> None:
     """Raise an InputError unless this is one flow, one state of it and a number of time steps."""
     require_state(flow, state)
     words = f"a whole number of 0 to {MAX_STEPS}"
-    require_number("steps", steps, lambda x: (x.dtype.kind in "iu") & (x >= 0) & (x <= MAX_STEPS), words)
+    require_number(
+        "steps", steps, lambda x: (x.dtype.kind in "iu") & (x >= 0) & (x <= MAX_STEPS), words
+    )
     require_match(flow, state)
 
 
@@ -78,7 +83,9 @@ def advance_by_jax(
 
     Arguments, derivatives and results are those of ``dynamics.advance``.
     """
-    derivatives = events is not None or moving_contacts  # those of a solve of each size would be compiled
+    derivatives = (
+        events is not None or moving_contacts
+    )  # those of a solve of each size would be compiled
     advance = _advance_of(flow, solver, state, steps)._replace(
         free_flight=free_flight,
         buffers=() if derivatives else contact_buffers(flow.grains),
@@ -95,7 +102,9 @@ def advance_by_jax(
 def observe_by_jax(
     flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Int[Array, ""], observe: Observe
 ) -> tuple[State, Tally, Any]:
-    """``advance_by_jax``, and the sum over all its time steps of what a function finds in them, see ``observer``."""
+    """``advance_by_jax``, and the sum over all its time steps of what a function finds in them, see
+    ``observer``.
+    """
     advance = _advance_of(flow, solver, state, steps)._replace(
         buffers=contact_buffers(flow.grains), observe=partial(observe, flow)
     )
@@ -110,7 +119,9 @@ def _advance_of(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: A
 
 
 def _until_stale(advance: Advance, now: Carry) -> Carry:
-    """New lists, and the events until one replica of the batch needs the next; at least one event."""
+    """New lists, and the events until one replica of the batch needs the next; at least one
+    event.
+    """
 
     def keep_going(at: tuple[Array, Carry]) -> Array:
         is_first, now = at
@@ -118,12 +129,16 @@ def _until_stale(advance: Advance, now: Carry) -> Carry:
         return any_replica(unfinished(advance, now)) & (is_first | ~stale)
 
     begin = jnp.bool_(True), refresh_lists(advance, now)
-    return lax.while_loop(keep_going, lambda at: (jnp.bool_(False), event(advance, at[1])), begin)[1]
+    return lax.while_loop(keep_going, lambda at: (jnp.bool_(False), event(advance, at[1])), begin)[
+        1
+    ]
 
 
 def _last(advance: Advance, begin: Carry) -> Carry:
     """The end of as many events as there are: a loop over lists round one over events."""
-    return lax.while_loop(lambda now: any_replica(unfinished(advance, now)), partial(_until_stale, advance), begin)
+    return lax.while_loop(
+        lambda now: any_replica(unfinished(advance, now)), partial(_until_stale, advance), begin
+    )
 
 
 def _next(advance: Advance, now: Carry) -> Carry:
@@ -134,7 +149,9 @@ def _next(advance: Advance, now: Carry) -> Carry:
 
 
 def _after_events(advance: Advance, begin: Carry, events: int) -> Carry:
-    """The end of a loop of fixed length; reverse mode keeps what is carried and computes all else again."""
+    """The end of a loop of fixed length; reverse mode keeps what is carried and computes all else
+    again.
+    """
 
     def visit(now: Carry, _: None) -> tuple[Carry, None]:
         going = any_replica(unfinished(advance, now))
@@ -144,9 +161,13 @@ def _after_events(advance: Advance, begin: Carry, events: int) -> Carry:
 
 
 def _nan_where(invalid: Array, values: T) -> T:
-    """The values, with NaN in place of every real number where they are invalid, and in all of their derivatives."""
+    """The values, with NaN in place of every real number where they are invalid, and in all of
+    their derivatives.
+    """
     factor = jnp.where(invalid, jnp.nan, 1.0)
-    return jax.tree.map(lambda x: x * factor.astype(x.dtype) if jnp.issubdtype(x.dtype, jnp.inexact) else x, values)
+    return jax.tree.map(
+        lambda x: x * factor.astype(x.dtype) if jnp.issubdtype(x.dtype, jnp.inexact) else x, values
+    )
 
 
 def _ended(advance: Advance, state: State, end: Carry) -> tuple[State, Tally]:
@@ -156,8 +177,12 @@ def _ended(advance: Advance, state: State, end: Carry) -> tuple[State, Tally]:
     return ended(state, *present(end.lists, state.side), end.velocities, sums)
 
 
-def ended(state: State, positions: Array, tilt: Array, velocities: Array, sums: RunningSums) -> tuple[State, Tally]:
-    """The state and the tally of an advance that led from a state to these positions, tilt and velocities."""
+def ended(
+    state: State, positions: Array, tilt: Array, velocities: Array, sums: RunningSums
+) -> tuple[State, Tally]:
+    """The state and the tally of an advance that led from a state to these positions, tilt and
+    velocities.
+    """
     grains = state.grains
     end = State(grains, positions, velocities, state.side, tilt)
     tally = sums.with_reading(readings(end)).tally(
@@ -176,13 +201,16 @@ def count_events(
     *,
     solver: ProjectedMethod = DEFAULT_SOLVER,
 ) -> Int[Array, ""]:
-    """Steps that an advance by the engine ``Jax`` visits: the ``events`` that it needs in a loop of fixed length.
+    """Steps that an advance by the engine ``Jax`` visits: the ``events`` that it needs in a loop of
+    fixed length.
 
     Arguments and errors are those of ``advance``.
     """
     require_advance(flow, state, steps)
     require_solver(solver)
-    advance = _advance_of(flow, solver, state, steps)._replace(free_flight=free_flight)  # as with a fixed length
+    advance = _advance_of(flow, solver, state, steps)._replace(
+        free_flight=free_flight
+    )  # as with a fixed length
 
     def keep_going(at: tuple[Array, Carry]) -> Array:
         return any_replica(unfinished(advance, at[1]))

@@ -22,7 +22,8 @@ def contact_delays(
 ) -> Float[Array, " pairs"]:
     """Zero, with the derivative of the time at which each contact of this step began.
 
-    Contacts that began long before belong to clusters. They have no moment of contact that could move.
+    Contacts that began long before belong to clusters. They have no moment of contact that could
+    move.
     """
     time, _ = first_contact_time(pairs, reach)
     begins = approaching & (jnp.abs(time) <= timestep)
@@ -38,8 +39,12 @@ def is_binary(near: PairList, contact: Array, grains: Grains) -> Bool[Array, " p
     return contact & (taken(degree, near.i) == 1) & (taken(degree, near.j) == 1)
 
 
-def delayed_shift(delays: Array, network: Contacts, grains: Grains, impulses: Impulses) -> Float[Array, "grains 2"]:
-    """Displacements of the grains, as the impulse of each contact's own approach acts later by its delay."""
+def delayed_shift(
+    delays: Array, network: Contacts, grains: Grains, impulses: Impulses
+) -> Float[Array, "grains 2"]:
+    """Displacements of the grains, as the impulse of each contact's own approach acts later by its
+    delay.
+    """
     moving = jnp.minimum(impulses.contacts, impulses.binary)
     delayed = moving * jnp.where(network.used, delays, 0)
     return -grain_impulses(network, delayed, grains.radii.size) / grains.masses[:, None]
@@ -48,7 +53,9 @@ def delayed_shift(delays: Array, network: Contacts, grains: Grains, impulses: Im
 def displaced(
     shift: Array, shear_rate: float | Array, lists: PairLists, velocities: Array, pairs: PairMotion
 ) -> tuple[Frame, Array, PairMotion]:
-    """Frame, velocities and pairs with the grains displaced, at the same velocities in the laboratory."""
+    """Frame, velocities and pairs with the grains displaced, at the same velocities in the
+    laboratory.
+    """
     x, y = shift[:, 0], shift[:, 1]
     frame, near = lists.frame, lists.near
     displacements = frame.displacements + jnp.stack([x - frame.strain * y, y], axis=-1)

@@ -1,8 +1,10 @@
-"""Advances one replica and sums what a user's function observes, with the engine ``Numba`` or ``Jax``.
+"""Advances one replica and sums what a user's function observes, with the engine ``Numba`` or
+``Jax``.
 
-The numba engine does not call the function. It records the steps that it visits until the buffer of records is full;
-then JAX applies the function to the records, and the engine goes on where it was suspended. So only the function is
-compiled, not an engine, and the trajectory is that of ``advance`` to the bit.
+The numba engine does not call the function. It records the steps that it visits until the buffer of
+records is full; then JAX applies the function to the records, and the engine goes on where it was
+suspended. So only the function is compiled, not an engine, and the trajectory is that of
+``advance`` to the bit.
 """
 
 from functools import partial
@@ -27,7 +29,10 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 
-_MOST_ROOM, _LEAST_ROOM = 64, 2  # records of one call; the least are those of a list and of its first contacts
+_MOST_ROOM, _LEAST_ROOM = (
+    64,
+    2,
+)  # records of one call; the least are those of a list and of its first contacts
 _MOST_BYTES = 2**26  # of the records of one call, above 170,000 grains those of the least
 _FEW = 16  # grains for a slot in the smaller one of two buffers for contacts
 
@@ -35,10 +40,12 @@ _FEW = 16  # grains for a slot in the smaller one of two buffers for contacts
 def advance_observed(
     flow: ShearFlow, numerics: Numerics, state: State, steps: Int[Array, ""], observe: Observe
 ) -> tuple[State, Tally, Any]:
-    """``advance``, and the sum over all its time steps of what a function finds in them, see ``observer``.
+    """``advance``, and the sum over all its time steps of what a function finds in them, see
+    ``observer``.
 
     Raises:
-      InputError: the engine asked for cannot do this, or the function returns something else than sums.
+      InputError: the engine asked for cannot do this, or the function returns something else than
+        sums.
     """
     engine = select_engine(flow, numerics, state, "observe")
     if isinstance(engine, Jax) or _depends_on_traced(observe, flow, state):
@@ -47,13 +54,17 @@ def advance_observed(
 
 
 def _depends_on_traced(observe: Observe, flow: ShearFlow, state: State) -> bool:
-    """Whether the function uses values from outside that JAX traces, whose derivatives ``_recorded`` would not see."""
+    """Whether the function uses values from outside that JAX traces, whose derivatives
+    ``_recorded`` would not see.
+    """
 
     def found(flow: ShearFlow, state: State) -> Any:
         return without_contacts(partial(observe, flow, state), state.positions.dtype)
 
     # First what it returns is judged: other things than numbers cannot be traced.
-    nothing_observed(partial(observe, flow, state), MOST_CONTACTS * flow.grains, state.positions.dtype)
+    nothing_observed(
+        partial(observe, flow, state), MOST_CONTACTS * flow.grains, state.positions.dtype
+    )
     return any(isinstance(x, Tracer) for x in jax.make_jaxpr(found)(flow, state).consts)
 
 
@@ -78,7 +89,9 @@ class _Progress(NamedTuple):
 def _recorded(
     observe: Observe, flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
 ) -> tuple[State, Tally, Any]:
-    """``advance_observed`` with the numba engine; its derivatives are those of the engine ``Jax``."""
+    """``advance_observed`` with the numba engine; its derivatives are those of the engine
+    ``Jax``.
+    """
 
     room = records_of_call(flow.grains)
 
@@ -91,7 +104,9 @@ def _recorded(
 
     dtype = state.positions.dtype
     at_start = partial(observe, flow, state)
-    sums = empty_sums(dtype)._replace(user_sums=nothing_observed(at_start, MOST_CONTACTS * flow.grains, dtype).sums)
+    sums = empty_sums(dtype)._replace(
+        user_sums=nothing_observed(at_start, MOST_CONTACTS * flow.grains, dtype).sums
+    )
     memory = jnp.zeros(numba_memory(flow).shape, dtype)
     start = _Progress(jnp.bool_(True), state, sums, jnp.zeros((), dtype), memory)
     end, sums = lax.while_loop(lambda now: now.unfinished, called, start)[1:3]
@@ -121,14 +136,24 @@ def _with_records(
         def with_contacts(slots: int) -> tuple[Any, Array]:
             contacts, impulses = _recorded_contacts(record, state.grains, slots)
             kicks = grain_impulses(contacts, impulses, flow.grains) / state.grains.masses[:, None]
-            return added(user_sums, observe(flow, before, contacts, impulses), jnp.ones((), dtype)), kicks
+            return added(
+                user_sums, observe(flow, before, contacts, impulses), jnp.ones((), dtype)
+            ), kicks
 
         size = jnp.sum(record[CONTACTS] > jnp.asarray([0, *sizes[:-1]], dtype), dtype=jnp.int32)
-        branches = [lambda: (user_sums, jnp.zeros_like(before.velocities)), *(partial(with_contacts, n) for n in sizes)]
+        branches = [
+            lambda: (user_sums, jnp.zeros_like(before.velocities)),
+            *(partial(with_contacts, n) for n in sizes),
+        ]
         sums, kicks = lax.switch(size, branches)
-        after = State(state.grains, before.positions, before.velocities + kicks, state.side, before.tilt)
-        until = jnp.where(k + 1 < count, records[jnp.minimum(k + 1, len(records) - 1), AT_STEP], flown)
-        # The step whose contacts have acted, in this record or an earlier one, is no step of the flight.
+        after = State(
+            state.grains, before.positions, before.velocities + kicks, state.side, before.tilt
+        )
+        until = jnp.where(
+            k + 1 < count, records[jnp.minimum(k + 1, len(records) - 1), AT_STEP], flown
+        )
+        # The step whose contacts have acted, in this record or an earlier one, is no step of the
+        # flight.
         weight = jnp.maximum(until - record[AT_STEP] - record[ACTED], 0)
         return added(sums, without_contacts(partial(observe, flow, after), dtype), weight)
 
@@ -142,7 +167,9 @@ def _recorded_state(record: Array, state: State) -> State:
     tilt, count = record[layout.TILTED], state.grains.radii.size
     numbers = record[layout.RECORD_HEAD : layout.RECORD_HEAD + layout.RECORD_OF_GRAIN * count]
     motion = numbers.reshape(count, layout.RECORD_OF_GRAIN)
-    return State(state.grains, wrap(motion[:, :2], state.side, tilt), motion[:, 2:], state.side, tilt)
+    return State(
+        state.grains, wrap(motion[:, :2], state.side, tilt), motion[:, 2:], state.side, tilt
+    )
 
 
 def _recorded_contacts(record: Array, grains: Grains, slots: int) -> tuple[Contacts, Array]:
@@ -150,7 +177,9 @@ def _recorded_contacts(record: Array, grains: Grains, slots: int) -> tuple[Conta
     from jaxgran.dynamics.numba_engine import layout
 
     first = layout.RECORD_HEAD + layout.RECORD_OF_GRAIN * grains.radii.size
-    rows = record[first : first + slots * layout.RECORD_OF_CONTACT].reshape(slots, layout.RECORD_OF_CONTACT)
+    rows = record[first : first + slots * layout.RECORD_OF_CONTACT].reshape(
+        slots, layout.RECORD_OF_CONTACT
+    )
     used = jnp.arange(slots, dtype=record.dtype) < record[layout.CONTACTS]
     rows = jnp.where(used[:, None], rows, 0)  # what was never written may be anything
     i, j = rows[:, 0].astype(jnp.int32), rows[:, 1].astype(jnp.int32)

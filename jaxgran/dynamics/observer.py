@@ -1,11 +1,13 @@
 """User sums: what a user's function observes in every time step, summed while the flow advances.
 
-The engine jumps over the steps in which no contact approaches. Such a flight is observed once, at its beginning and
-without contacts, and counts as the number of its steps. A step whose contacts act is observed with their network and
-impulses, before they act, and counts as one. So the weights add up to the number of steps.
+The engine jumps over the steps in which no contact approaches. Such a flight is observed once, at
+its beginning and without contacts, and counts as the number of its steps. A step whose contacts act
+is observed with their network and impulses, before they act, and counts as one. So the weights add
+up to the number of steps.
 
-What contacts do is summed exactly. What the flying grains do is summed to first order: peculiar velocities change by
-the strain of a flight, which ends with the next collision anywhere in the cell.
+What contacts do is summed exactly. What the flying grains do is summed to first order: peculiar
+velocities change by the strain of a flight, which ends with the next collision anywhere in the
+cell.
 """
 
 from collections.abc import Callable
@@ -22,12 +24,18 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
 _NUMBERS = (bool, int, float, np.generic, np.ndarray, jax.Array)
-Observe = Callable[[ShearFlow, State, Contacts, Array], Any]  # of a time step: state, contacts, their impulses
-ObserveNow = Callable[[Contacts, Array], Any]  # what is found in a step with these contacts and impulses
+Observe = Callable[
+    [ShearFlow, State, Contacts, Array], Any
+]  # of a time step: state, contacts, their impulses
+ObserveNow = Callable[
+    [Contacts, Array], Any
+]  # what is found in a step with these contacts and impulses
 
 
 class Observed(NamedTuple):
-    """Sums over the time steps so far, a pytree of arrays, and whether the contacts of the present step are in them."""
+    """Sums over the time steps so far, a pytree of arrays, and whether the contacts of the present
+    step are in them.
+    """
 
     sums: Any
     step_observed: Float[Array, ""]
@@ -37,14 +45,17 @@ def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> O
     """The sums of no time at all.
 
     Raises:
-      InputError: what is found is no pytree of arrays, or their shapes follow the number of slots for contacts.
+      InputError: what is found is no pytree of arrays, or their shapes follow the number of slots
+        for contacts.
     """
 
     def found(slots: int) -> Any:
         def numbers() -> Any:
             values = observe_now(_no_contacts(slots, dtype), jnp.zeros(slots, dtype))
             if not jax.tree.leaves(values):
-                raise InputError(f"observe must return at least one number, not {short_repr(values)}.")
+                raise InputError(
+                    f"observe must return at least one number, not {short_repr(values)}."
+                )
             for x in jax.tree.leaves(values):
                 if not isinstance(x, _NUMBERS) or jnp.asarray(x).dtype.kind not in "biuf":
                     raise InputError(f"observe must return real numbers, not {short_repr(x)}.")
@@ -54,19 +65,26 @@ def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> O
 
     few, many = found(1), found(slots)
     if few != many:
-        raise InputError("observe must return sums over the contacts: a step has slots for more or fewer of them.")
+        raise InputError(
+            "observe must return sums over the contacts: a step has slots for more or fewer of "
+            "them."
+        )
     return Observed(jax.tree.map(lambda x: jnp.zeros(x.shape, dtype), few), jnp.zeros((), dtype))
 
 
 def with_flight(user_sums: Observed, observe_now: ObserveNow, steps: Array) -> Observed:
-    """The sums with a flight of so many steps; where the contacts of its first step acted, that step is in already."""
+    """The sums with a flight of so many steps; where the contacts of its first step acted, that
+    step is in already.
+    """
     dtype = user_sums.step_observed.dtype
     weight = steps.astype(dtype) - user_sums.step_observed
     found = without_contacts(observe_now, dtype)
     return Observed(added(user_sums.sums, found, weight), jnp.zeros_like(user_sums.step_observed))
 
 
-def with_contacts(user_sums: Observed, observe_now: ObserveNow, network: Contacts, impulses: Array) -> Observed:
+def with_contacts(
+    user_sums: Observed, observe_now: ObserveNow, network: Contacts, impulses: Array
+) -> Observed:
     """The sums with the present step, whose contacts act."""
     one = jnp.ones_like(user_sums.step_observed)
     return Observed(added(user_sums.sums, observe_now(network, impulses), one), one)

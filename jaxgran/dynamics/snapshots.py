@@ -1,7 +1,8 @@
 """Snapshots: flows at single instants, with the contact forces at that instant.
 
-A time step begins with the state of a snapshot. Its contacts change the velocities at once (``collided``). The grains
-then fly freely for dt (``flown``). A contact force is the impulse over dt.
+A time step begins with the state of a snapshot. Its contacts change the velocities at once
+(``collided``). The grains then fly freely for dt (``flown``). A contact force is the impulse over
+dt.
 """
 
 from collections.abc import Sequence
@@ -37,7 +38,8 @@ _MOST_GRAIN_SNAPSHOTS = 10**9  # snapshots times grains of one series; memory is
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Snapshot(Indexable):
-    """A flow at the beginning of a time step, with the contacts of that step; a series has a leading (times,) axis.
+    """A flow at the beginning of a time step, with the contacts of that step; a series has a
+    leading (times,) axis.
 
     ===========  ===========  ====  ===============================================================
     field        shape        unit  meaning
@@ -69,20 +71,27 @@ class Snapshot(Indexable):
 
 
 def snapshot(flow: ShearFlow, state: State, solver: ProjectedMethod = DEFAULT_SOLVER) -> Snapshot:
-    """The snapshot of a flow now: the contact network of the next step is solved, and nothing moves."""
+    """The snapshot of a flow now: the contact network of the next step is solved, and nothing
+    moves.
+    """
     network, status = contacts_now(flow, state)
     solution = solve(network, flow.grains, flow.shear_rate, solver, jnp.any(network.approach < 0))
     restitution = jnp.asarray(flow.restitution, state.side.dtype)
     return snapshot_of(
-        flow, state, network, (1 + restitution) * solution.impulses, jnp.maximum(status, solution.status)
+        flow,
+        state,
+        network,
+        (1 + restitution) * solution.impulses,
+        jnp.maximum(status, solution.status),
     )
 
 
 def contacts_now(flow: ShearFlow, state: State) -> tuple[Contacts, Int[Array, ""]]:
-    """The contact network that the next time step of a flow would solve, in a buffer that holds any packing.
+    """The contact network that the next time step of a flow would solve, in a buffer that holds any
+    packing.
 
-    The status is ``capacity`` where contacts may be missing: a step looks further ahead than the list of pairs, or has
-    more contacts than discs that hardly overlap.
+    The status is ``capacity`` where contacts may be missing: a step looks further ahead than the
+      list of pairs, or has more contacts than discs that hardly overlap.
     """
     grains, velocities = state.grains, state.velocities
     pairs = outer_pairs(state.positions, grains, state.side, state.tilt)
@@ -97,7 +106,9 @@ def contacts_now(flow: ShearFlow, state: State) -> tuple[Contacts, Int[Array, ""
     return touching.compacted(room, bit_words(contact)).network(grains), status
 
 
-def snapshot_of(flow: ShearFlow, state: State, contacts: Contacts, impulses: Array, status: Array) -> Snapshot:
+def snapshot_of(
+    flow: ShearFlow, state: State, contacts: Contacts, impulses: Array, status: Array
+) -> Snapshot:
     """The snapshot of a flow, from its contacts and their solved impulses."""
     timestep, shear_rate, restitution = (
         jnp.asarray(x, state.side.dtype) for x in (flow.timestep, flow.shear_rate, flow.restitution)
@@ -114,23 +125,26 @@ def snapshot_series(
     solver: ProjectedMethod = DEFAULT_SOLVER,
     engine: Engine | None = None,
 ) -> tuple[State, Snapshot]:
-    """Shear a flow, or a batch of flows, and take snapshots at equal intervals of strain; ``jit`` and ``vmap`` apply.
+    """Shear a flow, or a batch of flows, and take snapshots at equal intervals of strain; ``jit``
+    and ``vmap`` apply.
 
     Args:
       flow: parameters of the state; or those (replicas,) of a batch, as in ``sample``.
       state: the flow at the beginning, usually from ``prepare``; or a batch of states.
-      strain: total strain, rounded to whole time steps; for a batch also (replicas,). A new value does not recompile.
-      count: number of snapshots, static. The first is taken after a strain of ``strain / count``. With a strain of
-        ``count`` time steps, there is a snapshot of every step.
+      strain: total strain, rounded to whole time steps; for a batch also (replicas,). A new value
+        does not recompile.
+      count: number of snapshots, static. The first is taken after a strain of ``strain / count``.
+        With a strain of ``count`` time steps, there is a snapshot of every step.
       solver, engine: as in ``advance``; the solver also solves the contacts of the snapshots.
 
     Returns:
-      The final state, which is that of the last snapshot, and the snapshots with a leading (times,) axis; before it
-      is that of the replicas of a batch.
+      The final state, which is that of the last snapshot, and the snapshots with a leading (times,)
+      axis; before it is that of the replicas of a batch.
 
     Raises:
-      InputError: (a ValueError) the axes of a batch differ; the strain is not a positive number, is shorter than one
-        time step a snapshot, or is longer than 2**31 - 1 time steps; or the engine cannot do this.
+      InputError: (a ValueError) the axes of a batch differ; the strain is not a positive number, is
+        shorter than one time step a snapshot, or is longer than 2**31 - 1 time steps; or the engine
+        cannot do this.
     """
     numerics = checked_numerics(solver, engine)
     strain = as_array(strain)
@@ -150,10 +164,16 @@ def _require_series(count: int, flow: ShearFlow, state: State, strain: Any) -> N
 def _snapshot_series(
     flow: ShearFlow, numerics: Numerics, state: State, strain: Array, count: int
 ) -> tuple[State, Snapshot]:
-    return lax.scan(partial(_later, flow, numerics), state, steps_of_blocks(steps_of_strain(flow, strain), count))
+    return lax.scan(
+        partial(_later, flow, numerics),
+        state,
+        steps_of_blocks(steps_of_strain(flow, strain), count),
+    )
 
 
-def _later(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Snapshot]:
+def _later(
+    flow: ShearFlow, numerics: Numerics, state: State, steps: Array
+) -> tuple[State, Snapshot]:
     """The state after some time steps, and its snapshot with the worst status since."""
     state, tally = advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
     new = snapshot(flow, state, numerics.solver)
@@ -163,10 +183,14 @@ def _later(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> t
 _snapshot, _after_steps = jax.jit(snapshot), jax.jit(_later)
 
 
-def snapshots_from(flow: ShearFlow, numerics: Numerics, state: State, strain: float | Array) -> Snapshot:
-    """The snapshots of all time steps of a strain that begins at a state, on the host, with the loaded contacts only.
+def snapshots_from(
+    flow: ShearFlow, numerics: Numerics, state: State, strain: float | Array
+) -> Snapshot:
+    """The snapshots of all time steps of a strain that begins at a state, on the host, with the
+    loaded contacts only.
 
-    For a strain of one time step or less it is a single snapshot instead of a series, with all contacts.
+    For a strain of one time step or less it is a single snapshot instead of a series, with all
+    contacts.
     """
     snapshots = [jax.tree.map(np.asarray, _snapshot(flow, state, numerics.solver))]
     steps = int(steps_of_strain(flow, strain))
@@ -184,10 +208,14 @@ def _series_of_loaded(snapshots: Sequence[Snapshot]) -> Snapshot:
     most = max(map(len, slots))
 
     def loaded(values: Array, slots: np.ndarray) -> np.ndarray:
-        return np.pad(np.asarray(values)[slots], [(0, most - len(slots)), *[(0, 0)] * (np.ndim(values) - 1)])
+        return np.pad(
+            np.asarray(values)[slots], [(0, most - len(slots)), *[(0, 0)] * (np.ndim(values) - 1)]
+        )
 
     def with_loaded(one: Snapshot, slots: np.ndarray) -> Snapshot:
-        contacts, impulses = jax.tree.map(partial(loaded, slots=slots), (one.contacts, one.impulses))
+        contacts, impulses = jax.tree.map(
+            partial(loaded, slots=slots), (one.contacts, one.impulses)
+        )
         return replace(one, contacts=contacts, impulses=impulses)
 
     return jax.tree.map(lambda *x: np.stack(x), *map(with_loaded, snapshots, slots))
@@ -201,7 +229,9 @@ def collided(snapshot: Snapshot) -> State:
 
 
 def flown(state: State, shear_rate: float | Array, time: float | Array) -> State:
-    """The state after free flight: grains keep their velocity in the laboratory frame, and the cell is sheared."""
+    """The state after free flight: grains keep their velocity in the laboratory frame, and the cell
+    is sheared.
+    """
     cx, cy = state.velocities[:, 0], state.velocities[:, 1]
     x, y = state.positions[:, 0], state.positions[:, 1]
     moved = jnp.stack([x + time * (cx + shear_rate * y), y + time * cy], axis=-1)

@@ -68,7 +68,9 @@ class Advance(NamedTuple):
     steps: Int[Array, ""]  # to fly in all
     solver: ProjectedMethod
     free_flight: bool | Array = True  # whether steps without an approaching contact are jumped over
-    buffers: tuple[int, ...] = ()  # contacts for which a solve is compiled, smallest first, beside all pairs
+    buffers: tuple[
+        int, ...
+    ] = ()  # contacts for which a solve is compiled, smallest first, beside all pairs
     moving_contacts: bool = False  # whether derivatives include that a contact moves in time
     observe: Callable[[State, Contacts, Array], Any] | None = None  # a function of the user's
 
@@ -129,19 +131,23 @@ def refresh_lists(advance: Advance, now: Carry) -> Carry:
     separations = separations_now(lists.near, lists.frame)
     new = now._replace(
         lists=lists,
-        pairs=pair_motion(lists.near.i, lists.near.j, separations, now.velocities, advance.flow.shear_rate),
+        pairs=pair_motion(
+            lists.near.i, lists.near.j, separations, now.velocities, advance.flow.shear_rate
+        ),
         slack=skin,
         closing_speed=closing_speed_bound(advance.flow, advance.grains, now.velocities, skin),
     )
     return where_active(stale, new, now)
 
 
-def closing_speed_bound(flow: ShearFlow, grains: Grains, velocities: Array, skin: Array) -> Float[Array, ""]:
+def closing_speed_bound(
+    flow: ShearFlow, grains: Grains, velocities: Array, skin: Array
+) -> Float[Array, ""]:
     """Bound on how fast the gap of a pair outside of the near list closes, in σγ̇.
 
-    A gap closes no faster than 2 max|c| from the peculiar velocities and γ̇ Δx Δy / r ≤ γ̇ r / 2 from
-    the shear, where r ≤ d + skin until a pair from outside the list touches. Within a flight |c|
-    grows by a factor 1 + γ̇ t at most.
+    A gap closes no faster than 2 max|c| from the peculiar velocities and γ̇ Δx Δy / r ≤ γ̇ r / 2
+    from the shear, where r ≤ d + skin until a pair from outside the list touches. Within a flight
+    |c| grows by a factor 1 + γ̇ t at most.
     """
     cx, cy = lax.stop_gradient(velocities).T  # the choice of pairs has no derivative
     longest = jnp.maximum(LONGEST_FLIGHT, flow.shear_rate * flow.timestep)
@@ -174,21 +180,29 @@ def event(advance: Advance, now: Carry) -> Carry:
 
 
 def _steps_to_fly(advance: Advance, now: Carry) -> Int[Array, ""]:
-    """Steps to the next contact that the near list holds; at least one if the present one is solved."""
+    """Steps to the next contact that the near list holds; at least one if the present one is
+    solved.
+    """
     flow, least = advance.flow, now.solved.astype(jnp.int32)
     time, closest = first_contact_time(now.pairs, now.lists.near.reach)
-    steps = jnp.maximum(first_step(time, flow.timestep, flow.activation_fraction), least.astype(time.dtype))
+    steps = jnp.maximum(
+        first_step(time, flow.timestep, flow.activation_fraction), least.astype(time.dtype)
+    )
     to_contact = smallest(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
     longest = jnp.divide(LONGEST_FLIGHT, flow.shear_rate) / flow.timestep
     of_list = now.slack / now.closing_speed / flow.timestep - flow.activation_fraction
     jump = jnp.minimum(to_contact, jnp.floor(jnp.minimum(of_list, longest)))
     wanted = jnp.where(advance.free_flight, jump, 0)
     remaining = advance.steps - now.step
-    return jnp.clip(jnp.minimum(wanted, remaining.astype(wanted.dtype)).astype(jnp.int32), least, remaining)
+    return jnp.clip(
+        jnp.minimum(wanted, remaining.astype(wanted.dtype)).astype(jnp.int32), least, remaining
+    )
 
 
 def fly(advance: Advance, now: Carry, steps: Int[Array, ""]) -> Carry:
-    """Exact free flight (SLLOD) over a number of steps: the laboratory velocities stay as they are."""
+    """Exact free flight (SLLOD) over a number of steps: the laboratory velocities stay as they
+    are.
+    """
     frame, shear_rate = now.lists.frame, advance.flow.shear_rate
     time = steps.astype(now.slack.dtype) * advance.flow.timestep
     sums = _with_flight(now.sums, now.velocities, advance.grains, steps, time, shear_rate)
@@ -216,7 +230,9 @@ def _with_flight(
     time: Array,
     shear_rate: float | Array,
 ) -> RunningSums:
-    """The sums with the time of a flight and ∫ Σ m c ⊗ c dt along it, where c_x falls by γ̇ c_y t."""
+    """The sums with the time of a flight and ∫ Σ m c ⊗ c dt along it, where c_x falls by γ̇ c_y
+    t.
+    """
     cx, cy = velocities[:, 0], velocities[:, 1]
     px, py = grains.masses * cx, grains.masses * cy
     products = ((px, cx), (px, cy), (py, cy))
@@ -240,7 +256,8 @@ class Collision(NamedTuple):
 
 
 def collide(advance: Advance, now: Carry, needs_solve: Bool[Array, ""]) -> Carry:
-    """The contacts of one step change the velocities; not where none approaches or no step needs it.
+    """The contacts of one step change the velocities; not where none approaches or no step needs
+    it.
 
     The contacts are compacted from the near list into the smallest buffer that holds them, and
     solved and summed there; more than the largest buffer holds are solved and summed on the list.
@@ -273,15 +290,21 @@ def collide(advance: Advance, now: Carry, needs_solve: Bool[Array, ""]) -> Carry
     )
     if collision.shift is None:
         return kicked
-    frame, velocities, pairs = displaced(collision.shift, flow.shear_rate, now.lists, kicked.velocities, kicked.pairs)
-    return kicked._replace(lists=replace(now.lists, frame=frame), velocities=velocities, pairs=pairs)
+    frame, velocities, pairs = displaced(
+        collision.shift, flow.shear_rate, now.lists, kicked.velocities, kicked.pairs
+    )
+    return kicked._replace(
+        lists=replace(now.lists, frame=frame), velocities=velocities, pairs=pairs
+    )
 
 
 def _no_collision(now: Carry, delays: Array | None) -> Collision:
     """No contact approaches."""
     still, zero = jnp.zeros_like(now.velocities), jnp.zeros_like(now.sums.largest[0])
     no_sums, shift = jnp.zeros_like(now.sums.contact), None if delays is None else still
-    return Collision(still, no_sums, zero, jnp.int32(0), zero, jnp.int32(0), now.sums.user_sums, shift)
+    return Collision(
+        still, no_sums, zero, jnp.int32(0), zero, jnp.int32(0), now.sums.user_sums, shift
+    )
 
 
 def _collision_in_buffer(
@@ -290,7 +313,9 @@ def _collision_in_buffer(
     """What no more than ``size`` contacts do; a single one is solved in closed form."""
     if size > 1:
         return _collision(advance, now, touching.compacted(size, words), None, active)
-    return _collision(advance, now, touching.compacted(_SINGLE_SLOTS, words), None, active, single=True)
+    return _collision(
+        advance, now, touching.compacted(_SINGLE_SLOTS, words), None, active, single=True
+    )
 
 
 def _collision(

@@ -1,8 +1,10 @@
-"""Tally: the sums over the steps of one sample, and the one table from which their places in memory follow.
+"""Tally: the sums over the steps of one sample, and the one table from which their places in memory
+follow.
 
-The fields of ``Tally`` are the table: every row has a shape, a unit, a meaning, and what adds to it. While the time
-loop runs, an engine keeps the sums as plain numbers. Their order follows from the table (``LAYOUT``), so no position is
-written down anywhere. A new sum over contacts is one row here and one term of ``contact.law.contact_terms``.
+The fields of ``Tally`` are the table: every row has a shape, a unit, a meaning, and what adds to
+  it. While the time loop runs, an engine keeps the sums as plain numbers. Their order follows from
+  the table (``LAYOUT``), so no position is written down anywhere. A new sum over contacts is one
+  row here and one term of ``contact.law.contact_terms``.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -17,21 +19,27 @@ from jaxgran.model.batches import equal_values
 from jaxgran.model.indexing import taken
 from jaxgran.model.status import DEEP_SHARE, Status
 
-# What adds to a sum. The running sums of an engine stand in this order, and within it in the order of the table.
+# What adds to a sum. The running sums of an engine stand in this order, and within it in the order
+# of the table.
 FLIGHT = "flight"  # the flight between two events
 CONTACT = "contact"  # each contact of a solved network, by the law of a contact
 SOLVE = "solve"  # each solved network
 LARGEST = "largest"  # each solved network; the largest value counts
 AT_END = "end"  # the end of an advance
-INSTANT = "instant"  # a reading of the state, which stands for the time since the last one, see ``velocity_scales``
+# a reading of the state, which stands for the time since the last one, see ``velocity_scales``
+INSTANT = "instant"
 KINDS = (FLIGHT, CONTACT, SOLVE, LARGEST, INSTANT)
 _TENSOR = (2, 2)  # symmetric; running sums hold xx, xy, yy
 
 
-def _sum(kind: str, unit: str, meaning: str, shape: tuple[int, ...] = (), joined: str = "sum") -> Any:
+def _sum(
+    kind: str, unit: str, meaning: str, shape: tuple[int, ...] = (), joined: str = "sum"
+) -> Any:
     """A row of the table. Parts are joined by their sum, or by the largest of them."""
     joined = "largest" if kind == LARGEST else joined
-    return field(metadata={"kind": kind, "unit": unit, "meaning": meaning, "shape": shape, "joined": joined})
+    return field(
+        metadata={"kind": kind, "unit": unit, "meaning": meaning, "shape": shape, "joined": joined}
+    )
 
 
 @jax.tree_util.register_dataclass
@@ -40,7 +48,9 @@ class Tally:
     """Sums over the steps of a sample of one replica; ``+`` joins two samples."""
 
     duration: Float[Array, "*b"] = _sum(FLIGHT, "1/γ̇", "time")
-    steps: Float[Array, "*b"] = _sum(FLIGHT, "–", "time steps, counted as a float (they exceed an int32)")
+    steps: Float[Array, "*b"] = _sum(
+        FLIGHT, "–", "time steps, counted as a float (they exceed an int32)"
+    )
     impulse: Float[Array, "*b"] = _sum(CONTACT, "mσγ̇", "contact impulses p")
     binary_impulse: Float[Array, "*b"] = _sum(
         CONTACT, "mσγ̇", "(1+α) μ₁₂ max(0, −u⁻), the impulses if every collision were binary"
@@ -48,37 +58,66 @@ class Tally:
     contact_moment: Float[Array, "*b 2 2"] = _sum(
         CONTACT, "mσ²γ̇", "σ ⊗ p n over the contacts, σ the centre-to-centre vector", _TENSOR
     )
-    binary_moment: Float[Array, "*b 2 2"] = _sum(CONTACT, "mσ²γ̇", "the same with the binary impulses", _TENSOR)
-    cluster_moment: Float[Array, "*b 2 2"] = _sum(
-        CONTACT, "mσ²γ̇", "the contact moment of clusters of three or more grains that push at once", _TENSOR
+    binary_moment: Float[Array, "*b 2 2"] = _sum(
+        CONTACT, "mσ²γ̇", "the same with the binary impulses", _TENSOR
     )
-    kinetic_moment: Float[Array, "*b 2 2"] = _sum(FLIGHT, "mσ²γ̇", "∫ Σ m c ⊗ c dt, exact along the flights", _TENSOR)
-    dissipation: Float[Array, "*b"] = _sum(CONTACT, "mσ²γ̇²", "energy lost in contacts, −½ Σ p (u⁻ + u⁺)")
-    complementarity: Float[Array, "*b"] = _sum(CONTACT, "mσ²γ̇²", "½ Σ p (u⁺ + α u⁻), zero where a solve is exact")
-    energy_change: Float[Array, "*b"] = _sum(AT_END, "mσ²γ̇²", "growth of the kinetic energy ½ Σ m c²")
-    contacts: Float[Array, "*b"] = _sum(CONTACT, "–", "contacts of the steps in which a network was solved")
+    cluster_moment: Float[Array, "*b 2 2"] = _sum(
+        CONTACT,
+        "mσ²γ̇",
+        "the contact moment of clusters of three or more grains that push at once",
+        _TENSOR,
+    )
+    kinetic_moment: Float[Array, "*b 2 2"] = _sum(
+        FLIGHT, "mσ²γ̇", "∫ Σ m c ⊗ c dt, exact along the flights", _TENSOR
+    )
+    dissipation: Float[Array, "*b"] = _sum(
+        CONTACT, "mσ²γ̇²", "energy lost in contacts, −½ Σ p (u⁻ + u⁺)"
+    )
+    complementarity: Float[Array, "*b"] = _sum(
+        CONTACT, "mσ²γ̇²", "½ Σ p (u⁺ + α u⁻), zero where a solve is exact"
+    )
+    energy_change: Float[Array, "*b"] = _sum(
+        AT_END, "mσ²γ̇²", "growth of the kinetic energy ½ Σ m c²"
+    )
+    contacts: Float[Array, "*b"] = _sum(
+        CONTACT, "–", "contacts of the steps in which a network was solved"
+    )
     loaded_contacts: Float[Array, "*b"] = _sum(CONTACT, "–", "contacts that carry an impulse")
     collisions: Float[Array, "*b"] = _sum(CONTACT, "–", "contacts that approach")
     solves: Float[Array, "*b"] = _sum(SOLVE, "–", "networks solved")
     iterations: Float[Array, "*b"] = _sum(SOLVE, "–", "solver iterations")
     unconverged: Float[Array, "*b"] = _sum(SOLVE, "–", "solves that ended above the tolerance")
     overlap: Float[Array, "*b"] = _sum(CONTACT, "σ", "overlaps of the contacts of solved networks")
-    deep_contacts: Float[Array, "*b"] = _sum(CONTACT, "–", "contacts that overlap by more than ``DEEP_OVERLAP``")
+    deep_contacts: Float[Array, "*b"] = _sum(
+        CONTACT, "–", "contacts that overlap by more than ``DEEP_OVERLAP``"
+    )
     binary_speed_moment: Float[Array, "*b 2 2"] = _sum(
-        CONTACT, "mσ³γ̇²", "the binary moment, each contact times its speed of approach max(0, −u⁻)", _TENSOR
+        CONTACT,
+        "mσ³γ̇²",
+        "the binary moment, each contact times its speed of approach max(0, −u⁻)",
+        _TENSOR,
     )
     binary_dissipation: Float[Array, "*b"] = _sum(
-        CONTACT, "mσ²γ̇²", "½ (1−α²) μ₁₂ max(0, −u⁻)², the energy lost if every collision were binary"
+        CONTACT,
+        "mσ²γ̇²",
+        "½ (1−α²) μ₁₂ max(0, −u⁻)², the energy lost if every collision were binary",
     )
     largest_overlap: Float[Array, "*b"] = _sum(LARGEST, "σ", "overlap of a contact")
     worst_residual: Float[Array, "*b"] = _sum(LARGEST, "–", "relative residual of a solve")
     local_kinetic: Float[Array, "*b"] = _sum(
-        INSTANT, "mσ²γ̇", "granular temperature relative to the mean velocity of a box, times the time between readings"
+        INSTANT,
+        "mσ²γ̇",
+        "granular temperature relative to the mean velocity of a box, times the time between "
+        "readings",
     )
     wave_kinetic: Float[Array, "*b"] = _sum(
-        INSTANT, "mσ²γ̇", "granular temperature of the longest waves, times the time between readings"
+        INSTANT,
+        "mσ²γ̇",
+        "granular temperature of the longest waves, times the time between readings",
     )
-    momentum_drift: Float[Array, "*b"] = _sum(AT_END, "–", "|Σ m c| over Σ m |c|, at the end", joined="largest")
+    momentum_drift: Float[Array, "*b"] = _sum(
+        AT_END, "–", "|Σ m c| over Σ m |c|, at the end", joined="largest"
+    )
     status: Int[Array, "*b"] = _sum(AT_END, "–", "status, the worst", joined="largest")
     observed: Any = None  # sums of what a user's function observes, a pytree; None without one
 
@@ -86,27 +125,39 @@ class Tally:
 
     @property
     def outcome(self) -> Int[Array | np.ndarray, "*b"]:
-        """The status, or ``deep_overlap`` if that is worse and too large a share of the contacts overlaps deeply."""
+        """The status, or ``deep_overlap`` if that is worse and too large a share of the contacts
+        overlaps deeply.
+        """
         xp = jnp if isinstance(self.status, jax.Array) else np
-        deep = xp.where(self.deep_contacts > DEEP_SHARE * self.contacts, Status.deep_overlap, Status.ok)
+        deep = xp.where(
+            self.deep_contacts > DEEP_SHARE * self.contacts, Status.deep_overlap, Status.ok
+        )
         return xp.maximum(self.status, deep.astype(self.status.dtype))
 
     def __add__(self, other: "Tally") -> "Tally":
         return jax.tree.map(lambda *both: jnp.stack(both), self, other).total(axis=0)
 
     def total(self, axis: int | tuple[int, ...]) -> "Tally":
-        """The tally of all that stands along leading axes: sums, and the larger of each of ``EXTREMES``."""
+        """The tally of all that stands along leading axes: sums, and the larger of each of
+        ``EXTREMES``.
+        """
         sums = {name: getattr(self, name) for name in TABLE}
-        joined = {name: x.max(axis) if name in EXTREMES else x.sum(axis) for name, x in sums.items()}
+        joined = {
+            name: x.max(axis) if name in EXTREMES else x.sum(axis) for name, x in sums.items()
+        }
         return Tally(**joined, observed=jax.tree.map(lambda x: x.sum(axis), self.observed))
 
 
 TABLE = {row.name: row.metadata for row in fields(Tally) if row.metadata}
-EXTREMES = tuple(name for name, row in TABLE.items() if row["joined"] == "largest")  # joined by the larger one
+EXTREMES = tuple(
+    name for name, row in TABLE.items() if row["joined"] == "largest"
+)  # joined by the larger one
 
 
 def _layout() -> dict[str, slice]:
-    """Where each of the running sums stands, for an engine that keeps them in one row of numbers."""
+    """Where each of the running sums stands, for an engine that keeps them in one row of
+    numbers.
+    """
     places, begin = {}, 0
     for kind in KINDS:
         for name, row in TABLE.items():
@@ -136,9 +187,9 @@ def span_of(kind: str) -> slice:
 class RunningSums(NamedTuple):
     """What the time loop of an engine carries, until ``tally`` gives the sums their names.
 
-    ==========  ===========  =======================================================================================
+    ==========  ===========  =======================================================================
     field       shape        meaning
-    ==========  ===========  =======================================================================================
+    ==========  ===========  =======================================================================
     flight      (numbers,)   the sums of each kind, in the order of ``LAYOUT``
     contact     (numbers,)
     solve       (numbers,)
@@ -146,8 +197,9 @@ class RunningSums(NamedTuple):
     instant     (numbers,)
     read_until  ()           time of the last reading
     status      ()           the worst status
-    user_sums   pytree       sums of what a user's function observes, see ``observer``; () without one
-    ==========  ===========  =======================================================================================
+    user_sums   pytree       sums of what a user's function observes, see ``observer``; () without
+                             one
+    ==========  ===========  =======================================================================
     """
 
     flight: Float[Array, " flight"]
@@ -180,7 +232,9 @@ class RunningSums(NamedTuple):
         return self._replace(instant=instant, read_until=self.duration)
 
     def tally(self, **ends: Array) -> Tally:
-        """The tally; what is known only at the end of an advance is given by name, but the status."""
+        """The tally; what is known only at the end of an advance is given by name, but the
+        status.
+        """
         ends = {**ends, "status": self.status}
         return Tally(**{name: ends[name] if name in ends else self._named(name) for name in TABLE})
 
@@ -188,13 +242,19 @@ class RunningSums(NamedTuple):
         kind, shape, place = TABLE[name]["kind"], TABLE[name]["shape"], LAYOUT[name]
         begin = span_of(kind).start
         numbers = getattr(self, kind)[place.start - begin : place.stop - begin]
-        return taken(numbers, jnp.asarray([0, 1, 1, 2])).reshape(2, 2) if shape == _TENSOR else numbers.reshape(shape)
+        return (
+            taken(numbers, jnp.asarray([0, 1, 1, 2])).reshape(2, 2)
+            if shape == _TENSOR
+            else numbers.reshape(shape)
+        )
 
 
 def sums_from_row(numbers: Float[Array, " numbers"], status: Int[Array, ""]) -> RunningSums:
     """The running sums of an engine that keeps them in one row."""
     flight, contact, solve, largest, instant = (numbers[span_of(kind)] for kind in KINDS)
-    return RunningSums(flight, contact, solve, largest, instant, numbers[place_of("read_until")], status)
+    return RunningSums(
+        flight, contact, solve, largest, instant, numbers[place_of("read_until")], status
+    )
 
 
 def empty_sums(dtype: jnp.dtype) -> RunningSums:
@@ -205,11 +265,15 @@ def empty_sums(dtype: jnp.dtype) -> RunningSums:
 def empty_tally(dtype: jnp.dtype) -> Tally:
     """The tally of no time at all."""
     zero = jnp.zeros((), dtype)
-    return empty_sums(dtype).tally(**{name: zero for name, row in TABLE.items() if row["kind"] not in KINDS})
+    return empty_sums(dtype).tally(
+        **{name: zero for name, row in TABLE.items() if row["kind"] not in KINDS}
+    )
 
 
 def flat_tally(tally: Tally, shape: tuple[int, ...]) -> np.ndarray:
-    """All numbers of a tally with leading axes of the given shape, (*shape, numbers) in double precision."""
+    """All numbers of a tally with leading axes of the given shape, (*shape, numbers) in double
+    precision.
+    """
     leaves = [np.asarray(leaf, np.float64).reshape(*shape, -1) for leaf in jax.tree.leaves(tally)]
     return np.concatenate(leaves, axis=-1)
 
@@ -226,7 +290,9 @@ def tally_from_flat(numbers: np.ndarray, dtype: jnp.dtype, observed: Any = None)
     edges = np.cumsum([leaf.size for leaf in leaves])
     parts = zip(np.split(numbers, edges, axis=-1)[:-1], leaves, strict=True)
     shape = numbers.shape[:-1]
-    return jax.tree.unflatten(structure, [x.reshape(*shape, *leaf.shape).astype(leaf.dtype) for x, leaf in parts])
+    return jax.tree.unflatten(
+        structure, [x.reshape(*shape, *leaf.shape).astype(leaf.dtype) for x, leaf in parts]
+    )
 
 
 def _documentation() -> str:
@@ -237,7 +303,10 @@ def _documentation() -> str:
         rows.append((name, str(row["shape"]), row["unit"], largest + row["meaning"]))
     widths = [max(len(row[column]) for row in rows) for column in range(4)]
     border = "  ".join("=" * width for width in widths)
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines = [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
     return "\n".join(["", "", border, lines[0], border, *lines[1:], border])
 
 

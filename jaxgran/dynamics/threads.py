@@ -1,4 +1,6 @@
-"""Tasks in threads of this process: compiled programs run without the interpreter's lock, so threads use all cores."""
+"""Tasks in threads of this process: compiled programs run without the interpreter's lock, so
+threads use all cores.
+"""
 
 import time
 from collections.abc import Callable, Generator, Iterable, Sequence
@@ -22,14 +24,17 @@ class Cancelled(BaseException):
 def in_threads(
     function: Callable[..., T], tasks: Sequence[tuple], threads: int, on_message: Send
 ) -> Generator[tuple[int, T]]:
-    """Run a function on the arguments of every task, started in order, and yield each result when it is there.
+    """Run a function on the arguments of every task, started in order, and yield each result when
+    it is there.
 
-    When the generator ends early, each thread ends at its next message. Ctrl-C also stops the numba engine, within one
-    step. A thread that takes longer, as for a compilation, is left behind; Python ends after it.
+    When the generator ends early, each thread ends at its next message. Ctrl-C also stops the numba
+    engine, within one step. A thread that takes longer, as for a compilation, is left behind;
+    Python ends after it.
 
     Args:
-      function: called with the arguments of a task and ``send``. A long task calls ``send`` after each of its parts,
-        before it uses what the part returned: a part that was stopped has no valid results, and ``send`` then raises.
+      function: called with the arguments of a task and ``send``. A long task calls ``send`` after
+        each of its parts, before it uses what the part returned: a part that was stopped has no
+        valid results, and ``send`` then raises.
       tasks: arguments of each call.
       threads: most threads at a time.
       on_message: called with everything that is sent, in the thread of the caller.

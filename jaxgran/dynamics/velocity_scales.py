@@ -1,12 +1,14 @@
-"""How the fluctuations of velocity divide over lengths: within a neighbourhood, and in the longest waves of the cell.
+"""How the fluctuations of velocity divide over lengths: within a neighbourhood, and in the longest
+waves of the cell.
 
-In large dissipative flows the granular temperature grows with the number of grains, because long waves of velocity
-carry energy of their own. The temperature relative to the mean velocity of a neighbourhood does not.
+In large dissipative flows the granular temperature grows with the number of grains, because long
+waves of velocity carry energy of their own. The temperature relative to the mean velocity of a
+neighbourhood does not.
 
-Both are readings of a state. The engines take them once in ``READ_AFTER`` collisions of every grain, after the
-contacts of a step, and at the end of an advance: more seldom, the instants would scatter more than the flow does; more
-often, they would cost more than 2 % of a step. A collision takes (1 − α²)/2N of the energy, and half of that is missing
-in a reading just after it.
+Both are readings of a state. The engines take them once in ``READ_AFTER`` collisions of every
+grain, after the contacts of a step, and at the end of an advance: more seldom, the instants would
+scatter more than the flow does; more often, they would cost more than 2 % of a step. A collision
+takes (1 − α²)/2N of the energy, and half of that is missing in a reading just after it.
 """
 
 import jax
@@ -29,10 +31,10 @@ def readings(state: State) -> Float[Array, " instant"]:
 def local_temperature(state: State) -> Float[Array, ""]:
     """Granular temperature relative to the mean velocity of boxes of about 25 grains, in mσ²/t².
 
-    The cell is divided into equal boxes that are sheared as it is. In a box of k grains, Σ m (c − c̄)² is on average
-    2 (k − 1) T for uncorrelated velocities, with c̄ the mean velocity by mass. So the sums of all boxes are divided by
-    the sum of 2 (k − 1). With fewer than about 56 grains there is one box, and the result differs from the granular
-    temperature by N/(N − 1) only.
+    The cell is divided into equal boxes that are sheared as it is. In a box of k grains, Σ m (c −
+    c̄)² is on average 2 (k − 1) T for uncorrelated velocities, with c̄ the mean velocity by mass.
+    So the sums of all boxes are divided by the sum of 2 (k − 1). With fewer than about 56 grains
+    there is one box, and the result differs from the granular temperature by N/(N − 1) only.
     """
     count = state.positions.shape[0]
     across = boxes_across(count)
@@ -56,10 +58,14 @@ def boxes_across(count: int) -> int:
 def wave_temperature(state: State) -> Float[Array, ""]:
     """Kinetic energy of the four longest waves of velocity, as a granular temperature, in mσ²/t².
 
-    It is the mean of |Σ m c exp(ik·r)|² / Σ m over four wave vectors k and both components of c. Uncorrelated
-    velocities of granular temperature T give T on average, which is equipartition.
+    It is the mean of |Σ m c exp(ik·r)|² / Σ m over four wave vectors k and both components of c.
+    Uncorrelated velocities of granular temperature T give T on average, which is equipartition.
     """
-    phases = 2 * jnp.pi * jnp.einsum("wa,ga->wg", jnp.asarray(WAVES, state.positions.dtype), _in_cell(state))
+    phases = (
+        2
+        * jnp.pi
+        * jnp.einsum("wa,ga->wg", jnp.asarray(WAVES, state.positions.dtype), _in_cell(state))
+    )
     momenta = state.grains.masses[:, None] * state.velocities
     amplitudes = [jnp.einsum("wg,ga->wa", wave(phases), momenta) for wave in (jnp.cos, jnp.sin)]
     return sum(jnp.mean(part**2) for part in amplitudes) / jnp.sum(state.grains.masses)

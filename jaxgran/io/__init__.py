@@ -1,4 +1,5 @@
 """Files: trajectories (GSD), tracks of discs, arrays with a checksum.
 
-It imports `dynamics` and the folders below it, but neither `sampling` nor `analysis`. Begin with `trajectory`.
+It imports `dynamics` and the folders below it, but neither `sampling` nor `analysis`. Begin with
+`trajectory`.
 """

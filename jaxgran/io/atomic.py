@@ -1,8 +1,9 @@
 """Checks of output paths, and named arrays in HDF5 files with a checksum.
 
-The SHA-256 checksum follows the HDF5 content, and other readers ignore it. Content is assembled and parsed in memory:
-a full disk then raises an ``OSError`` with its errno, and the HDF5 library, which may crash on a damaged file, never
-sees one. Dimensions are not named, since naming them takes ten times as long as everything else.
+The SHA-256 checksum follows the HDF5 content, and other readers ignore it. Content is assembled and
+parsed in memory: a full disk then raises an ``OSError`` with its errno, and the HDF5 library, which
+may crash on a damaged file, never sees one. Dimensions are not named, since naming them takes ten
+times as long as everything else.
 """
 
 import hashlib
@@ -34,17 +35,22 @@ def require_place(path: Path, option: str, ending: str) -> None:
     """Raise an InputError unless a file with this suffix can be written to ``path``."""
     if path.suffix != ending:
         raise InputError(
-            f"{option} must be a file name that ends in {ending}, not {short_repr(str(path))}.", field=option
+            f"{option} must be a file name that ends in {ending}, not {short_repr(str(path))}.",
+            field=option,
         )
     if len(os.fsencode(path.name)) > _LONGEST_NAME:
         raise InputError(
-            f"{option} must be a file name of at most {_LONGEST_NAME} bytes, not {short_repr(path.name)}.", field=option
+            f"{option} must be a file name of at most {_LONGEST_NAME} bytes, not "
+            f"{short_repr(path.name)}.",
+            field=option,
         )
     if os.path.isdir(path):
         raise InputError(f"{option} must be a file, and {str(path)!r} is a folder.", field=option)
     if not os.path.isdir(path.parent):
         raise InputError(
-            f"{option} must be in a folder that exists, and {short_repr(str(path.parent))} does not.", field=option
+            f"{option} must be in a folder that exists, and {short_repr(str(path.parent))} does "
+            "not.",
+            field=option,
         )
     try:
         with tempfile.TemporaryFile(dir=path.parent):
@@ -54,7 +60,8 @@ def require_place(path: Path, option: str, ending: str) -> None:
                 pass
     except OSError as error:
         raise InputError(
-            f"{option} must be in a folder that can be written to, and {str(path)!r} cannot: {error.strerror}.",
+            f"{option} must be in a folder that can be written to, and {str(path)!r} cannot: "
+            f"{error.strerror}.",
             field=option,
         ) from None
 
@@ -76,7 +83,8 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[st
 
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-    """Read the arrays and the description written by ``write_arrays``; CorruptFile for any other content.
+    """Read the arrays and the description written by ``write_arrays``; CorruptFile for any other
+    content.
 
     Raises:
       InputError: (a ValueError) the file has another version of the format.
@@ -95,7 +103,11 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
             version = file.attrs.get("format_version")
             arrays = {name: np.asarray(file[name]) for name in json.loads(str(file.attrs["names"]))}
             about = json.loads(str(file.attrs["about"]))
-    except (OSError, KeyError, ValueError) as error:  # the checksum is right, but write_arrays did not write the file
+    except (
+        OSError,
+        KeyError,
+        ValueError,
+    ) as error:  # the checksum is right, but write_arrays did not write the file
         raise CorruptFile(f"{path.name} cannot be read: {error}") from error
     if difference := other_version(short_repr(str(path)), version, FORMAT_VERSION):
         raise InputError(difference)

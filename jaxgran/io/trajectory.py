@@ -1,22 +1,28 @@
 """Trajectories in GSD files, for OVITO, freud and HOOMD-blue, and for reading back.
 
-The GSD box is centred at the origin and spanned by (L, 0) and (tilt·L, L), the lattice of the sheared cell. Chunks of
-the GSD schema have single precision; further chunks store exact values, so a state is read back bit for bit.
+The GSD box is centred at the origin and spanned by (L, 0) and (tilt·L, L), the lattice of the
+sheared cell. Chunks of the GSD schema have single precision; further chunks store exact values, so
+a state is read back bit for bit.
 
-=============================  ==============  ======  =================================================================
+=============================  ==============  ======  =============================================
 chunk                          shape           unit    meaning
-=============================  ==============  ======  =================================================================
+=============================  ==============  ======  =============================================
 configuration/step             (1,)            –       time steps since the first frame
 configuration/box              (6,)            σ, –    L, L, 0, tilt, 0, 0; two dimensions
 particles/position             (grains, 3)     σ       centres, in the box around the origin; z = 0
-particles/velocity             (grains, 3)     σγ̇      peculiar velocities c, before the contacts act; in the
-                                                       laboratory c + γ̇ y x̂, up to the velocity of the origin
+particles/velocity             (grains, 3)     σγ̇      peculiar velocities c, before the contacts
+                                                       act; in the
+                                                       laboratory c + γ̇ y x̂, up to the velocity of
+                                                       the origin
 particles/diameter, /mass      (grains,)       σ, m    diameters and masses
-bonds/group                    (bonds, 2)      –       pairs i < j of grains in loaded contact in the steps that follow,
+bonds/group                    (bonds, 2)      –       pairs i < j of grains in loaded contact in
+                                                       the steps that follow,
                                                        one step or those of a strain
-log/bonds/force                (bonds,)        mσγ̇²    their contact forces, impulse p over dt, mean over these steps
+log/bonds/force                (bonds,)        mσγ̇²    their contact forces, impulse p over dt,
+                                                       mean over these steps
 log/particles/contact_force    (grains,)       mσγ̇²    sum of the forces of its bonds, by magnitude
-log/particles/cluster          (grains,)       –       number of its cluster; grains of one cluster are joined by bonds
+log/particles/cluster          (grains,)       –       number of its cluster; grains of one cluster
+                                                       are joined by bonds
 log/particles/cluster_size     (grains,)       –       grains of its cluster; 1 without bonds
 log/particles/exact_position   (grains, 2)     σ       positions of the state, in [0, L)
 log/particles/exact_velocity   (grains, 2)     σγ̇      velocities of the state
@@ -24,12 +30,14 @@ log/particles/exact_radius     (grains,)       σ       radii; in the first fram
 log/particles/exact_mass       (grains,)       m       masses; in the first frame only
 log/jaxgran/side, /tilt        (1,)            σ, –    side and tilt of the state
 log/jaxgran/strain             (1,)            –       strain since the first frame
-log/jaxgran/force_strain       (1,)            –       strain over which forces are averaged; dt for one step
+log/jaxgran/force_strain       (1,)            –       strain over which forces are averaged; dt for
+                                                       one step
 log/jaxgran/timestep           (1,)            1/γ̇     dt
 log/jaxgran/shear_rate         (1,)            1/t     γ̇
 log/jaxgran/restitution        (1,)            –       α
-log/jaxgran/format_version     (1,)            –       of these chunks; files of another one are refused
-=============================  ==============  ======  =================================================================
+log/jaxgran/format_version     (1,)            –       of these chunks; files of another one are
+                                                       refused
+=============================  ==============  ======  =============================================
 """
 
 import os
@@ -81,7 +89,8 @@ class Trajectory:
     ================  =========  =====  ============================================================
     field             shape      unit   meaning
     ================  =========  =====  ============================================================
-    state             State      –      states with a leading (frames,) axis, before the contacts act
+    state             State      –      states with a leading (frames,) axis, before the contacts
+                                        act
     step              (frames,)  –      time steps since the first frame
     strain            (frames,)  –      strain since the first frame
     timestep          ()         1/γ̇    dt
@@ -90,8 +99,9 @@ class Trajectory:
     packing_fraction  ()         –      ν
     ================  =========  =====  ============================================================
 
-    All are NumPy arrays, in double precision even if JAX uses single precision. Strain, time step, shear rate and
-    restitution are NaN if the file, written by another program, does not contain them.
+    All are NumPy arrays, in double precision even if JAX uses single precision. Strain, time step,
+    shear rate and restitution are NaN if the file, written by another program, does not contain
+    them.
     """
 
     state: State
@@ -116,9 +126,10 @@ def write_frame(path: Path, frame: Snapshot, step: int) -> None:
     """Append a frame to a trajectory; step 0 starts a new file, replacing an old one.
 
     Args:
-      path: GSD file, complete after every frame. Where the file system fails to take a frame, it ends with the one
-        before.
-      frame: one snapshot of the flow; or a series of every time step from the frame on, whose forces are averaged.
+      path: GSD file, complete after every frame. Where the file system fails to take a frame, it
+        ends with the one before.
+      frame: one snapshot of the flow; or a series of every time step from the frame on, whose
+        forces are averaged.
       step: time steps since the first frame.
 
     Raises:
@@ -153,28 +164,38 @@ def write_trajectory(
     Args:
       path: GSD file, with the ending ``.gsd``.
       flow: parameters of the flow.
-      states: states with a leading (frames,) axis, such as ``state`` of the series of ``snapshot_series``.
-      strain: strain at each frame, shape (frames,), increasing; stored as a number of time steps since the first.
+      states: states with a leading (frames,) axis, such as ``state`` of the series of
+        ``snapshot_series``.
+      strain: strain at each frame, shape (frames,), increasing; stored as a number of time steps
+        since the first.
       overwrite: whether to replace an existing file.
-      force_strain: strain from each state on over which the contact forces are averaged; None for one time step.
+      force_strain: strain from each state on over which the contact forces are averaged; None for
+        one time step.
       solver: solves the contacts of the time steps after each state.
 
     Raises:
-      InputError: (a ValueError) the file exists or cannot be written, the states have no leading axis or do not fit
-        the flow, the strain does not increase by at least one time step from frame to frame, or a frame averages
-        forces beyond the next one.
+      InputError: (a ValueError) the file exists or cannot be written, the states have no leading
+        axis or do not fit the flow, the strain does not increase by at least one time step from
+        frame to frame, or a frame averages forces beyond the next one.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise InputError(f"path must be a file name, not {short_repr(path)}.")
     path = Path(path)
     check_trajectory(path)
     if path.exists() and not overwrite:
-        raise InputError(f"path must be a new file, or overwrite must be True: {short_repr(str(path))} exists.")
+        raise InputError(
+            f"path must be a new file, or overwrite must be True: {short_repr(str(path))} exists."
+        )
     if not isinstance(states, State) or np.ndim(states.side) != 1 or np.size(states.side) == 0:
-        raise InputError("states must have one leading axis of frames: stack them, or take those of snapshot_series.")
+        raise InputError(
+            "states must have one leading axis of frames: stack them, or take those of "
+            "snapshot_series."
+        )
     strains = np.asarray(strain, np.float64)
     if strains.shape != np.shape(states.side):
-        raise InputError(f"strain must have one number for each of the {np.size(states.side)} states.")
+        raise InputError(
+            f"strain must have one number for each of the {np.size(states.side)} states."
+        )
     steps = steps_of_strain(flow, strains - strains[0])
     if not np.all(np.diff(steps) >= 1):
         raise InputError("strain must increase by at least one time step from frame to frame.")
@@ -206,7 +227,9 @@ def _write(path: Path, mode: str, frame: Snapshot, step: int) -> None:
 
 
 def _gsd_frame(seen: Snapshot, step: int):
-    """A snapshot, or the first of a series with the mean forces of all, as a frame of the GSD library."""
+    """A snapshot, or the first of a series with the mean forces of all, as a frame of the GSD
+    library.
+    """
     _, hoomd = _library()
     arrays = jax.tree.map(np.asarray, seen)
     steps = arrays if arrays.state.side.ndim else jax.tree.map(lambda x: x[None], arrays)
@@ -227,7 +250,9 @@ def _gsd_frame(seen: Snapshot, step: int):
     frame.bonds.types = ["contact"]
     frame.bonds.typeid = np.zeros(len(pairs), np.uint32)
     frame.bonds.group = pairs
-    constants = {"exact_radius": state.grains.radii, "exact_mass": state.grains.masses} if step == 0 else {}
+    constants = (
+        {"exact_radius": state.grains.radii, "exact_mass": state.grains.masses} if step == 0 else {}
+    )
     grain_log = {
         **_by_grain(pairs, forces, len(state.positions)),
         "exact_position": state.positions,
@@ -253,15 +278,21 @@ def _gsd_frame(seen: Snapshot, step: int):
 
 
 def _mean_forces(steps: Snapshot) -> tuple[Int[np.ndarray, "bonds 2"], Float[np.ndarray, " bonds"]]:
-    """Pairs i < j in loaded contact at any of the time steps, and the means of their forces over all of them."""
+    """Pairs i < j in loaded contact at any of the time steps, and the means of their forces over
+    all of them.
+    """
     time, slot = np.nonzero(steps.impulses > 0)
-    pairs = np.sort(np.stack([steps.contacts.i[time, slot], steps.contacts.j[time, slot]], axis=-1), axis=-1)
+    pairs = np.sort(
+        np.stack([steps.contacts.i[time, slot], steps.contacts.j[time, slot]], axis=-1), axis=-1
+    )
     bonds, bond = np.unique(pairs, axis=0, return_inverse=True)
     forces = np.asarray(steps.impulses[time, slot] / steps.timestep[time], np.float64)
     return bonds, np.bincount(bond.ravel(), forces, minlength=len(bonds)) / len(steps.timestep)
 
 
-def _by_grain(pairs: Int[np.ndarray, "bonds 2"], forces: Float[np.ndarray, " bonds"], grains: int) -> Chunks:
+def _by_grain(
+    pairs: Int[np.ndarray, "bonds 2"], forces: Float[np.ndarray, " bonds"], grains: int
+) -> Chunks:
     """Contact force and cluster of each grain."""
     labels, sizes = cluster_labels(pairs[:, 0], pairs[:, 1], grains)
     return {
@@ -278,8 +309,9 @@ def _in_space(vectors: Float[np.ndarray, "grains 2"]) -> Float[np.ndarray, "grai
 def read_trajectory(path: str | os.PathLike) -> Trajectory:
     """Read a trajectory from a GSD file; one written by jaxgran is read back bit for bit.
 
-    A file of another program must have a square two-dimensional cell, sheared or not, with positions and velocities,
-    which are taken as peculiar. Missing diameters and masses are set to one.
+    A file of another program must have a square two-dimensional cell, sheared or not, with
+    positions and velocities, which are taken as peculiar. Missing diameters and masses are set to
+    one.
 
     Args:
       path: GSD file.
@@ -288,8 +320,8 @@ def read_trajectory(path: str | os.PathLike) -> Trajectory:
       The states of all frames and the parameters of the flow.
 
     Raises:
-      InputError: (a ValueError) the file does not exist, is not such a trajectory, or has another version of the
-        format; the message says why.
+      InputError: (a ValueError) the file does not exist, is not such a trajectory, or has another
+        version of the format; the message says why.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise InputError(f"path must be a file name, not {short_repr(path)}.")
@@ -301,7 +333,9 @@ def read_trajectory(path: str | os.PathLike) -> Trajectory:
     except InputError as reason:
         if reason.field == "format_version":
             raise
-        raise InputError(f"{name} is not a trajectory of discs in a sheared cell: {reason}.") from None
+        raise InputError(
+            f"{name} is not a trajectory of discs in a sheared cell: {reason}."
+        ) from None
     except Exception as error:  # a damaged file may raise any exception
         reason = short_repr(str(error)).strip("'\"").rstrip(".")
         raise InputError(f"{name} is not a readable GSD file: {reason}.") from None
@@ -318,7 +352,9 @@ def read_trajectory(path: str | os.PathLike) -> Trajectory:
 
 
 def _frames(path: str) -> Iterator[tuple[int, dict[str, float], State]]:
-    """Step, parameters and state of every frame; an InputError with a reason if something is missing."""
+    """Step, parameters and state of every frame; an InputError with a reason if something is
+    missing.
+    """
     fl, _ = _library()
     with fl.open(path, "r") as file:
         if file.schema != "hoomd":
@@ -337,29 +373,48 @@ def _frames(path: str) -> Iterator[tuple[int, dict[str, float], State]]:
             frame = _chunks(file, k, first)
             if reason := _why_invalid(frame, first):
                 raise InputError(f"in frame {k} {reason}")
-            numbers = {name: float(frame.get(f"log/jaxgran/{name}", [np.nan])[0]) for name in _NUMBERS}
+            numbers = {
+                name: float(frame.get(f"log/jaxgran/{name}", [np.nan])[0]) for name in _NUMBERS
+            }
             yield int(frame.get("configuration/step", [0])[0]), numbers, _state(frame)
 
 
 def _chunks(file: Any, frame: int, first: Chunks) -> Chunks:
     """The chunks of a frame; missing ones default to those of the first frame."""
-    chunks = {name: file.read_chunk(frame=frame, name=name) for name in _READ if file.chunk_exists(frame, name)}
+    chunks = {
+        name: file.read_chunk(frame=frame, name=name)
+        for name in _READ
+        if file.chunk_exists(frame, name)
+    }
     return {**first, **chunks}
 
 
 def _why_invalid(frame: Chunks, first: Chunks) -> str:
     """The reason why a frame cannot become a State; "" if it can."""
     grains, box = _grains(frame), frame.get("configuration/box", np.ones(6))
-    arrays = {name: x for name, x in frame.items() if name.startswith("particles/") and name != "particles/N"}
+    arrays = {
+        name: x
+        for name, x in frame.items()
+        if name.startswith("particles/") and name != "particles/N"
+    }
     conditions = (
         (grains > 0, "there are no grains"),
         (grains == _grains(first), "the number of grains differs from that of the first frame"),
         (frame.get("configuration/dimensions", [3])[0] == 2, "the cell has three dimensions"),
         (box[0] == box[1] and box[0] > 0, "the cell is not a square"),
-        *((f"particles/{name}" in frame, f"there are no {meaning}") for name, meaning in _NEEDED.items()),
-        (all(len(x) == grains for x in arrays.values()), "some array does not have one entry for each grain"),
+        *(
+            (f"particles/{name}" in frame, f"there are no {meaning}")
+            for name, meaning in _NEEDED.items()
+        ),
+        (
+            all(len(x) == grains for x in arrays.values()),
+            "some array does not have one entry for each grain",
+        ),
         (all(np.isfinite(x).all() for x in (box, *arrays.values())), "some number is not finite"),
-        *((np.all(frame.get(f"particles/{x}", 1) > 0), f"some {x} is not positive") for x in ("diameter", "mass")),
+        *(
+            (np.all(frame.get(f"particles/{x}", 1) > 0), f"some {x} is not positive")
+            for x in ("diameter", "mass")
+        ),
     )
     return next((reason for holds, reason in conditions if not holds), "")
 
@@ -382,9 +437,17 @@ def _state(frame: Chunks) -> State:
     else:
         ones = np.ones(grains, np.float32)
         radii, masses = frame.get("particles/diameter", ones) / 2, frame.get("particles/mass", ones)
-        side, tilt = frame["configuration/box"][0], np.asarray(remap_tilt(jnp.asarray(frame["configuration/box"][3])))
+        side, tilt = (
+            frame["configuration/box"][0],
+            np.asarray(remap_tilt(jnp.asarray(frame["configuration/box"][3]))),
+        )
         from_corner = jnp.asarray(frame["particles/position"][:, :2] + side / 2)
         positions = np.asarray(wrap(from_corner, jnp.asarray(side), jnp.asarray(tilt)))
         velocities = frame["particles/velocity"][:, :2]
-    parts: dict[str, Any] = {"positions": positions, "velocities": velocities, "side": side, "tilt": tilt}
+    parts: dict[str, Any] = {
+        "positions": positions,
+        "velocities": velocities,
+        "side": side,
+        "tilt": tilt,
+    }
     return State(Grains(radii, masses), **parts)

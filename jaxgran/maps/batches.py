@@ -20,18 +20,20 @@ from jaxgran.sampling.timestep import COARSE_TIMESTEP
 
 _LARGEST_CPU_BATCH = 4  # replicas of one core between two reports
 _PAIR_BYTES = 48  # of memory for each pair of grains, in a search that compares all pairs
-_GRAIN_BYTES = 2500  # of memory for each grain: lists, network and state; grains are rounded up to a power of two
+# of memory for each grain: lists, network and state; grains are rounded up to a power of two
+_GRAIN_BYTES = 2500
 _SHARE_OF_MEMORY = 0.5  # of a device, for one batch
 _DEFAULT_MEMORY = 8 * 2**30  # bytes of a device that does not report its memory
 _LARGEST_COST_RATIO = 2  # between replicas that advance in lockstep
 
 
 def predicted_cost(flow: ShearFlow, timestep: float | None = None) -> float:
-    """Relative cost of a unit of strain of a flow, at its own or another time step: a fit to measured times.
+    """Relative cost of a unit of strain of a flow, at its own or another time step: a fit to
+    measured times.
 
-    The cost is proportional to the number of grains. Dense and dissipative flows form contact networks; the second
-    factor is their cost at dt = 1e-3. Steps without a contact are jumped over, so ten times as many steps cost little
-    more than twice as much.
+    The cost is proportional to the number of grains. Dense and dissipative flows form contact
+    networks; the second factor is their cost at dt = 1e-3. Steps without a contact are jumped over,
+    so ten times as many steps cost little more than twice as much.
     """
     dt = float(flow.timestep if timestep is None else timestep)
     alpha, nu = float(flow.restitution), float(flow.packing_fraction)
@@ -43,7 +45,9 @@ def replica_cost(flow: ShearFlow, equilibrate: float | None, strain: float | Non
     preparation = LEAST_PREPARATION if equilibrate is None else equilibrate
     coarse = max(COARSE_TIMESTEP, float(flow.timestep))
     sample = LEAST_SAMPLE if strain is None else strain
-    return preparation * predicted_cost(flow, coarse) + (sample + RELAXATION_STRAIN) * predicted_cost(flow)
+    return preparation * predicted_cost(flow, coarse) + (
+        sample + RELAXATION_STRAIN
+    ) * predicted_cost(flow)
 
 
 def points_of_part(settings: MapSettings) -> list[int]:
@@ -65,7 +69,9 @@ def points_of_part(settings: MapSettings) -> list[int]:
     return sorted(shares[number - 1])
 
 
-def remaining_batches(settings: MapSettings, workers: int, checkpoint: Checkpoint | None) -> list[list[Key]]:
+def remaining_batches(
+    settings: MapSettings, workers: int, checkpoint: Checkpoint | None
+) -> list[list[Key]]:
     """The batches that a checkpoint does not have yet, the interrupted ones first."""
     if checkpoint is None:
         return batches(settings, workers)
@@ -75,7 +81,9 @@ def remaining_batches(settings: MapSettings, workers: int, checkpoint: Checkpoin
 
 
 def batches(settings: MapSettings, workers: int, without: Container[Key] = ()) -> list[list[Key]]:
-    """The replicas in batches of one number of grains and of similar cost, the most expensive first."""
+    """The replicas in batches of one number of grains and of similar cost, the most expensive
+    first.
+    """
     flows = settings.flows()
     costs = [predicted_cost(flow) for flow in flows]
     order = sorted(range(len(costs)), key=lambda point: -costs[point])
@@ -83,7 +91,12 @@ def batches(settings: MapSettings, workers: int, without: Container[Key] = ()) -
     tasks: list[list[Key]] = []
     for grains in {flow.grains: None for flow in flows}:
         points = [point for point in order if flows[point].grains == grains and point in chosen]
-        keys = [(point, seed) for point in points for seed in range(settings.seeds) if (point, seed) not in without]
+        keys = [
+            (point, seed)
+            for point in points
+            for seed in range(settings.seeds)
+            if (point, seed) not in without
+        ]
         most = batch_size(grains, len(keys), workers) if keys else 0
         alike: list[list[Key]] = []
         for key in keys:
@@ -96,12 +109,18 @@ def batches(settings: MapSettings, workers: int, without: Container[Key] = ()) -
 
 
 def batch_size(grains: int, count: int, workers: int) -> int:
-    """Replicas of a batch: a few on a CPU, as many as fit into half the memory on an accelerator."""
+    """Replicas of a batch: a few on a CPU, as many as fit into half the memory on an
+    accelerator.
+    """
     devices, device = jax.device_count(), jax.local_devices()[0]
     if device.platform == "cpu":
-        largest = max(min(devices, count), min(_LARGEST_CPU_BATCH * devices, count // (8 * workers)))
+        largest = max(
+            min(devices, count), min(_LARGEST_CPU_BATCH * devices, count // (8 * workers))
+        )
         # equal batches: a smaller last one would compile again
         return next(size for size in range(largest, 0, -1) if count % size == 0)
     memory = (device.memory_stats() or {}).get("bytes_limit", _DEFAULT_MEMORY)
-    per_replica = _GRAIN_BYTES * max(64, 1 << (grains - 1).bit_length()) + _PAIR_BYTES * min(grains, 512) ** 2
+    per_replica = (
+        _GRAIN_BYTES * max(64, 1 << (grains - 1).bit_length()) + _PAIR_BYTES * min(grains, 512) ** 2
+    )
     return int(max(1, min(count, _SHARE_OF_MEMORY * memory * devices / per_replica)))

@@ -1,17 +1,21 @@
-"""Checkpoint: a folder beside the output with the finished part of a map, kept until the map is complete.
+"""Checkpoint: a folder beside the output with the finished part of a map, kept until the map is
+complete.
 
-==================  ================================================================================================
+==================  ================================================================================
 file                content
-==================  ================================================================================================
-``map.nc``          the finished replicas, all parameters of the map, and the versions that its results depend on
-``journal-*.nc``    a batch that is running, see ``journal``; the end of its name is a hash of the parameters, versions
+==================  ================================================================================
+``map.nc``          the finished replicas, all parameters of the map, and the versions that its
+                    results depend on
+``journal-*.nc``    a batch that is running, see ``journal``; the end of its name is a hash of the
+                    parameters, versions
                     and sources
-``lock``            locked by the process that writes here; released when that process ends for any reason
-==================  ================================================================================================
+``lock``            locked by the process that writes here; released when that process ends for any
+                    reason
+==================  ================================================================================
 
-``map.nc`` is written again whenever a batch ends, but at most so often that this takes a twentieth of the time; the
-journals of batches that it lacks stay. Every file has a checksum. A damaged journal is removed, and its replicas are
-computed again.
+``map.nc`` is written again whenever a batch ends, but at most so often that this takes a twentieth
+of the time; the journals of batches that it lacks stay. Every file has a checksum. A damaged
+journal is removed, and its replicas are computed again.
 """
 
 import glob
@@ -60,8 +64,9 @@ class Checkpoint:
       resume: whether to continue the unfinished map of an earlier run.
 
     Raises:
-      InputError: (a ValueError) another process writes to this output. Or there is an unfinished map, and ``resume`` is
-        False or its parameters or versions differ; the message names the difference.
+      InputError: (a ValueError) another process writes to this output. Or there is an unfinished
+        map, and ``resume`` is False or its parameters or versions differ; the message names the
+        difference.
     """
 
     def __init__(self, output: Path, settings: MapSettings, resume: bool):
@@ -70,7 +75,9 @@ class Checkpoint:
         self.done: dict[Key, Replica] = {}
         self.damaged: list[str] = []
         self._identity = _identity(settings)
-        self._name = hashlib.sha256(json.dumps(self._identity, sort_keys=True).encode()).hexdigest()[:12]
+        self._name = hashlib.sha256(
+            json.dumps(self._identity, sort_keys=True).encode()
+        ).hexdigest()[:12]
         self._ended: list[Path] = []  # journals of the batches that map.nc lacks
         self._next_write = 0.0
         self._lock = _locked(self.folder, output)
@@ -92,7 +99,8 @@ class Checkpoint:
             self._next_write = ended + (ended - begun) / WRITING_SHARE
 
     def journal_path(self, keys: Sequence[Key]) -> Path:
-        """The file for the journal of a batch, named after its first replica and all that its numbers depend on.
+        """The file for the journal of a batch, named after its first replica and all that its
+        numbers depend on.
 
         So a worker of an earlier map that still writes here writes no file of this one.
         """
@@ -109,7 +117,9 @@ class Checkpoint:
                 self.damaged.append(path.name)
                 path.unlink(missing_ok=True)
                 continue
-            if self.done.keys() & set(keys):  # its journal was about to be removed when the run ended
+            if self.done.keys() & set(
+                keys
+            ):  # its journal was about to be removed when the run ended
                 path.unlink(missing_ok=True)
             else:
                 found.append(keys)
@@ -120,7 +130,9 @@ class Checkpoint:
         if not finished and self._ended:
             with suppress(OSError):  # the disc is full: the journals stay
                 self._write()
-        if (finished or not (self.done or self._journals())) and _is_lock_of(self.folder, self._lock):
+        if (finished or not (self.done or self._journals())) and _is_lock_of(
+            self.folder, self._lock
+        ):
             try:  # renamed in one operation, so that the next run finds the whole folder or none
                 os.replace(self.folder, self._discarded)
             except OSError:
@@ -137,7 +149,9 @@ class Checkpoint:
         """Remove temporary files of a process that was killed while it wrote or removed files."""
         shutil.rmtree(self._discarded, ignore_errors=True)
         unique = "[0-9a-f]" * 16
-        beside = self._output.parent.glob(f".{glob.escape(self._output.stem)}-{unique}{self._output.suffix}")
+        beside = self._output.parent.glob(
+            f".{glob.escape(self._output.stem)}-{unique}{self._output.suffix}"
+        )
         for path in [*beside, *self.folder.glob(f".*-{unique}.nc")]:
             path.unlink(missing_ok=True)
 
@@ -148,11 +162,14 @@ class Checkpoint:
             try:
                 arrays, begun = read_arrays(path)
             except CorruptFile:
-                raise InputError(f"the file map.nc in {str(self.folder)!r} is damaged: remove the folder.") from None
+                raise InputError(
+                    f"the file map.nc in {str(self.folder)!r} is damaged: remove the folder."
+                ) from None
             if len(arrays["keys"]) or any(self.folder.glob("journal-*.nc")):
                 if not resume:
                     raise InputError(
-                        f"output {str(self._output)!r} has an unfinished map: pass `resume=True` to continue it, or "
+                        f"output {str(self._output)!r} has an unfinished map: pass `resume=True` "
+                        "to continue it, or "
                         f"remove the folder {str(self.folder)!r}.",
                         field="output",
                     )
@@ -188,18 +205,26 @@ class Checkpoint:
         for name, value in self._identity.items():
             if begun.get(name) != value:
                 raise InputError(
-                    f"the unfinished map in {str(self.folder)!r} has {name} {begun.get(name)!r}, not {value!r}: "
+                    f"the unfinished map in {str(self.folder)!r} has {name} {begun.get(name)!r}, "
+                    f"not {value!r}: "
                     "resume it with the same parameters, or remove the folder."
                 )
 
 
 def _arrays_of(replicas: Mapping[Key, Replica]) -> dict[str, np.ndarray]:
     """Replicas as arrays for a file, in which each state has arrays of its own."""
-    tallies = [flat_tally(one.sample.tally, np.shape(one.sample.tally.steps)) for one in replicas.values()]
+    tallies = [
+        flat_tally(one.sample.tally, np.shape(one.sample.tally.steps)) for one in replicas.values()
+    ]
     arrays = {
-        "keys": np.array([(*key, one.status) for key, one in replicas.items()], np.int64).reshape(-1, 3),
+        "keys": np.array([(*key, one.status) for key, one in replicas.items()], np.int64).reshape(
+            -1, 3
+        ),
         "tallies": np.array(tallies),
-        "numbers": np.array([(one.strain, one.sample.area, one.sample.shear_rate) for one in replicas.values()], float),
+        "numbers": np.array(
+            [(one.strain, one.sample.area, one.sample.shear_rate) for one in replicas.values()],
+            float,
+        ),
     }
     for row, one in enumerate(replicas.values()):
         if one.state is not None:
@@ -219,7 +244,9 @@ def _replicas_of(arrays: Mapping[str, np.ndarray], settings: MapSettings) -> dic
         sample = Sample(tallies, dtype.type(area), dtype.type(shear_rate), flows[point].grains)
         state = None
         if f"state-{row}-0" in arrays:
-            found: list[Any] = [arrays[f"state-{row}-{k}"] for k in range(6)]  # the leaves of a state
+            found: list[Any] = [
+                arrays[f"state-{row}-{k}"] for k in range(6)
+            ]  # the leaves of a state
             state = State(Grains(*found[:2]), *found[2:])
         replicas[point, seed] = Replica(sample, status, float(strain), state)
     return replicas
@@ -228,7 +255,11 @@ def _replicas_of(arrays: Mapping[str, np.ndarray], settings: MapSettings) -> dic
 def _identity(settings: MapSettings) -> dict[str, object]:
     """All that the results depend on, bit for bit, in types of JSON."""
     versions = versions_of(made_with())
-    here = {"precision": precision(), "device": default_device().platform, "number of running sums": len(TABLE)}
+    here = {
+        "precision": precision(),
+        "device": default_device().platform,
+        "number of running sums": len(TABLE),
+    }
     parameters = {field.name: getattr(settings, field.name) for field in fields(settings)}
     engine = "auto" if settings.engine is None else settings.engine.name
     identity = {
@@ -243,7 +274,8 @@ def _identity(settings: MapSettings) -> dict[str, object]:
 
 
 def _locked(folder: Path, output: Path) -> int | None:
-    """Lock a folder, made if missing, until this process ends; InputError if another process has locked it.
+    """Lock a folder, made if missing, until this process ends; InputError if another process has
+    locked it.
 
     On a file system without locks, a second run on one output is not detected.
     """
@@ -252,7 +284,8 @@ def _locked(folder: Path, output: Path) -> int | None:
             folder.mkdir(parents=True, exist_ok=True)
         except FileExistsError:
             raise InputError(
-                f"output needs the folder {str(folder)!r}, and a file has this name: rename it.", field="output"
+                f"output needs the folder {str(folder)!r}, and a file has this name: rename it.",
+                field="output",
             ) from None
         if fcntl is None:
             return None
@@ -265,7 +298,8 @@ def _locked(folder: Path, output: Path) -> int | None:
         except BlockingIOError:
             os.close(handle)
             raise InputError(
-                f"another process is writing {str(output)!r}: wait for it, or choose another `output`."
+                f"another process is writing {str(output)!r}: wait for it, or choose another "
+                "`output`."
             ) from None
         except OSError:
             return handle

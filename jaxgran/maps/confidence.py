@@ -8,14 +8,23 @@ from jaxgran.maps.schema import ERROR_SOURCES
 from jaxgran.sampling.budget import BUDGET, MEASURED_POLYDISPERSITY, error_budget
 from jaxgran.sampling.observables import OBSERVABLES
 
-LAWS = f"time step, size and tolerance by laws measured at a polydispersity of {MEASURED_POLYDISPERSITY:g}"
+LAWS = (
+    "time step, size and tolerance by laws measured at a polydispersity of "
+    f"{MEASURED_POLYDISPERSITY:g}"
+)
 """What an interval of other sizes says."""
 
 
-def confidence_variables(grid: PointGrid, averages: PointAverages, tolerance: float) -> dict[str, xr.Variable]:
-    """The variables NAME_ci95 of a map, for the names in ``BUDGET``, with the dimension ``error_source``."""
+def confidence_variables(
+    grid: PointGrid, averages: PointAverages, tolerance: float
+) -> dict[str, xr.Variable]:
+    """The variables NAME_ci95 of a map, for the names in ``BUDGET``, with the dimension
+    ``error_source``.
+    """
     flows = grid.batch
-    other_sizes = grid.classes is not None or np.any(flows.polydispersity != MEASURED_POLYDISPERSITY)
+    other_sizes = grid.classes is not None or np.any(
+        flows.polydispersity != MEASURED_POLYDISPERSITY
+    )
     budget = error_budget(
         averages.values,
         averages.stderrs,
@@ -29,7 +38,10 @@ def confidence_variables(grid: PointGrid, averages: PointAverages, tolerance: fl
     for name in BUDGET:
         observable = OBSERVABLES[name]
         values = np.stack([budget[name][source] for source in ERROR_SOURCES], axis=-1)
-        about = {"long_name": f"half-width of the 95 % interval of {observable.meaning}", "units": observable.unit}
+        about = {
+            "long_name": f"half-width of the 95 % interval of {observable.meaning}",
+            "units": observable.unit,
+        }
         about |= {"comment": LAWS} if other_sizes else {}
         variables[f"{name}_ci95"] = grid.variable(values, about, "error_source")
     return variables

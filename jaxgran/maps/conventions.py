@@ -1,23 +1,28 @@
-"""What the CF conventions ask of a map: attributes by which other programs understand its variables.
+"""What the CF conventions ask of a map: attributes by which other programs understand its
+variables.
 
-=====================  ===================================  ==========================================================
+=====================  ===================================  ========================================
 attribute              of                                   meaning
-=====================  ===================================  ==========================================================
-units                  all numbers but flags                "1": all are in units of m, σ and t, so they have no
+=====================  ===================================  ========================================
+units                  all numbers but flags                "1": all are in units of m, σ and t, so
+                                                            they have no
                                                             dimension
 reduced_unit           numbers that are not pure numbers    this unit, such as "m sigma / t^2"
-ancillary_variables    values with errors                   names of their errors and of their status, "/status" where
+ancillary_variables    values with errors                   names of their errors and of their
+                                                            status, "/status" where
                                                             it is in the root
-cell_methods           averages                             what a value is averaged over; a realization is a seed
-coordinates            all, in the file                     number of grains and time step where a map has one of each
+cell_methods           averages                             what a value is averaged over; a
+                                                            realization is a seed
+coordinates            all, in the file                     number of grains and time step where a
+                                                            map has one of each
 flag_values,           statuses                             numbers and their meanings
 flag_meanings
 standard_name          seed, statuses                       the name of CF
-=====================  ===================================  ==========================================================
+=====================  ===================================  ========================================
 
-σ is the mean diameter, m the mass of a grain of that diameter (unless grains have their own), t the unit of time: 1/γ̇
-at a shear rate of 1. A program that knows SI units would read "m / t^2" as metres per tonne squared, so such texts are
-not in ``units``.
+σ is the mean diameter, m the mass of a grain of that diameter (unless grains have their own), t the
+unit of time: 1/γ̇ at a shear rate of 1. A program that knows SI units would read "m / t^2" as
+metres per tonne squared, so such texts are not in ``units``.
 """
 
 import xarray as xr
@@ -30,7 +35,9 @@ _STATUS_NAMES = {"/": "aggregate_quality_flag", "seeds": "quality_flag"}
 
 
 def follow_conventions(data: xr.Dataset, group: str) -> xr.Dataset:
-    """A group whose variables have the attributes of the module; it comes with long names and units in m, σ and t."""
+    """A group whose variables have the attributes of the module; it comes with long names and units
+    in m, σ and t.
+    """
     for name in map(str, data.variables):
         about = data[name].attrs
         if "units" in about:
@@ -42,7 +49,9 @@ def follow_conventions(data: xr.Dataset, group: str) -> xr.Dataset:
         linked = [f"{name}_{ending}" for ending in _COMPANIONS if f"{name}_{ending}" in data]
         is_average = name in GROUPS.get(group, ())
         if linked or is_average:
-            about["ancillary_variables"] = " ".join([*linked, "status" if "status" in data else "/status"])
+            about["ancillary_variables"] = " ".join(
+                [*linked, "status" if "status" in data else "/status"]
+            )
         if is_average:
             about["cell_methods"] = _cell_methods(name)
     return data

@@ -16,7 +16,9 @@ class Interrupted(KeyboardInterrupt):
 
 
 def is_interruption(error: BaseException | None) -> bool:
-    """Whether an interruption led to the error: compiled code that is interrupted raises an error of its own."""
+    """Whether an interruption led to the error: compiled code that is interrupted raises an error
+    of its own.
+    """
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None

@@ -1,8 +1,8 @@
 """Journal of a batch: the tallies of all its advances, and the last state.
 
-The next step of a batch depends on its tallies only. So an interrupted batch is repeated from the start with the
-tallies from its journal, which takes almost no time. It then continues from the last state, with the same results bit
-for bit as without the interruption.
+The next step of a batch depends on its tallies only. So an interrupted batch is repeated from the
+start with the tallies from its journal, which takes almost no time. It then continues from the last
+state, with the same results bit for bit as without the interruption.
 """
 
 import time
@@ -30,10 +30,12 @@ _LONGEST_PAUSE = 45.0  # seconds; longest time between two writes, also of a lar
 
 
 class Journal:
-    """An ``ObserveBatch`` that keeps a journal of another one, and first repeats the journal of an earlier run.
+    """An ``ObserveBatch`` that keeps a journal of another one, and first repeats the journal of an
+    earlier run.
 
     Args:
-      path: file of the journal. If its folder is removed, the journal is not written, and the batch continues.
+      path: file of the journal. If its folder is removed, the journal is not written, and the batch
+        continues.
       keys: point and seed of each replica of the batch, in order.
       advance: advances the batch after the end of the journal.
 
@@ -52,12 +54,19 @@ class Journal:
             self._read()
 
     def __call__(
-        self, flow: ShearFlow, numerics: Numerics, state: State, steps: Array, observe: Observable | None = None
+        self,
+        flow: ShearFlow,
+        numerics: Numerics,
+        state: State,
+        steps: Array,
+        observe: Observable | None = None,
     ) -> tuple[State, Tally]:
         k, self.position = self.position, self.position + 1
         if k < len(self.tallies):
             if np.array_equal(self.steps[k], steps):
-                return self._repeated(k, state, None if observe is None else observed_shapes(observe, flow))
+                return self._repeated(
+                    k, state, None if observe is None else observed_shapes(observe, flow)
+                )
             raise CorruptFile(f"{self.path.name} is the journal of another run")
         state, tally = self.advance(flow, numerics, state, steps, observe)
         self.steps.append(np.asarray(steps))
@@ -68,7 +77,9 @@ class Journal:
         return state, tally
 
     def _repeated(self, k: int, state: State, observed: Any) -> tuple[State, Tally]:
-        """Tally ``k`` of the journal; with the last tally comes the stored state, and before it the given one."""
+        """Tally ``k`` of the journal; with the last tally comes the stored state, and before it the
+        given one.
+        """
         tally = tally_from_flat(self.tallies[k], state.positions.dtype, observed)
         if k + 1 < len(self.tallies):
             return state, tally
@@ -78,10 +89,16 @@ class Journal:
     def _write(self) -> None:
         begun = time.monotonic()
         states = {f"state_{k}": leaf for k, leaf in enumerate(self.leaves)}
-        most = max(numbers.shape[-1] for numbers in self.tallies)  # with a user's sums in those of the sample
-        tallies = [np.pad(numbers, ((0, 0), (0, most - numbers.shape[-1]))) for numbers in self.tallies]
+        most = max(
+            numbers.shape[-1] for numbers in self.tallies
+        )  # with a user's sums in those of the sample
+        tallies = [
+            np.pad(numbers, ((0, 0), (0, most - numbers.shape[-1]))) for numbers in self.tallies
+        ]
         series = {"steps": np.stack(self.steps), "tallies": np.stack(tallies)}
-        with suppress(FileNotFoundError):  # the folder was removed; ``Checkpoint.add`` makes it again
+        with suppress(
+            FileNotFoundError
+        ):  # the folder was removed; ``Checkpoint.add`` makes it again
             write_arrays(self.path, {"keys": self.keys, **series, **states}, {})
         now = time.monotonic()
         self.next = now + max(SECONDS, min((now - begun) / WRITING_SHARE, _LONGEST_PAUSE))

@@ -1,4 +1,6 @@
-"""Observables of the user's in a map: the check of their function, what identifies it, and their variables."""
+"""Observables of the user's in a map: the check of their function, what identifies it, and their
+variables.
+"""
 
 from __future__ import annotations
 
@@ -23,15 +25,34 @@ if TYPE_CHECKING:
     from jaxgran.model.flow import ShearFlow
     from jaxgran.sampling.sample import Sample
 
-_TAKEN = {*OBSERVABLES, "status", "correlation_strain", *("grains", "timestep", "packing_fraction", "restitution")}
-_TAKEN |= {"point_grains", "error_source", "axis_a", "axis_b", "stresses", "theory", "diagnostics", "seeds", "sums"}
+_TAKEN = {
+    *OBSERVABLES,
+    "status",
+    "correlation_strain",
+    *("grains", "timestep", "packing_fraction", "restitution"),
+}
+_TAKEN |= {
+    "point_grains",
+    "error_source",
+    "axis_a",
+    "axis_b",
+    "stresses",
+    "theory",
+    "diagnostics",
+    "seeds",
+    "sums",
+}
 _TAKEN |= {"states"}
 
 
 def require_observe(observe: Any, flow: ShearFlow) -> None:
-    """Raise an InputError unless a function returns numbers or arrays, summed over contacts, by names of its own."""
+    """Raise an InputError unless a function returns numbers or arrays, summed over contacts, by
+    names of its own.
+    """
     if not callable(observe):
-        raise refused("observe", observe, "must be a function that is passed to `ratio_map`, or None")
+        raise refused(
+            "observe", observe, "must be a function that is passed to `ratio_map`, or None"
+        )
     try:
         hash(observe)
     except TypeError:
@@ -39,27 +60,39 @@ def require_observe(observe: Any, flow: ShearFlow) -> None:
     shapes = observed_shapes(observe, flow)
     names = list(shapes) if isinstance(shapes, dict) else []
     if not names or not all(isinstance(x, jax.ShapeDtypeStruct) for x in shapes.values()):
-        raise InputError("observe must return a dictionary of numbers or arrays by name.", field="observe")
+        raise InputError(
+            "observe must return a dictionary of numbers or arrays by name.", field="observe"
+        )
     if not all(isinstance(name, str) and name.isidentifier() for name in names):
-        raise InputError(f"observe must return names without spaces and signs, not {short_repr(names)}.")
+        raise InputError(
+            f"observe must return names without spaces and signs, not {short_repr(names)}."
+        )
     taken = [name for name in names if name in _TAKEN or name.endswith(("_stderr", "_ci95"))]
     if taken:
-        raise InputError(f"observe must return names that a map does not have, not {short_repr(taken[0])}.")
+        raise InputError(
+            f"observe must return names that a map does not have, not {short_repr(taken[0])}."
+        )
 
 
 def sums_by_name(settings: MapSettings) -> dict[str, jax.ShapeDtypeStruct] | None:
     """Shape and dtype of the sums of each of the user's observables; None without any."""
-    return None if settings.observe is None else observed_shapes(settings.observe, settings.flows()[0])
+    return (
+        None if settings.observe is None else observed_shapes(settings.observe, settings.flows()[0])
+    )
 
 
 def identity_of(settings: MapSettings) -> str | None:
-    """What is compared before a map is continued or replaced: names and ``digest_of`` the function; None without one.
+    """What is compared before a map is continued or replaced: names and ``digest_of`` the function;
+    None without one.
 
     So a function may move to another module, and what it calls counts too.
     """
     if settings.observe is None:
         return None
-    return f"{', '.join(sums_by_name(settings) or ())}: {digest_of(settings.observe, settings.flows()[0])}"
+    return (
+        f"{', '.join(sums_by_name(settings) or ())}: "
+        f"{digest_of(settings.observe, settings.flows()[0])}"
+    )
 
 
 def own_variables(
@@ -67,8 +100,8 @@ def own_variables(
 ) -> dict[str, xr.Variable]:
     """The variables NAME, NAME_stderr and NAME_ci95 in the root, for what ``observe`` returns.
 
-    An array has the dimensions NAME_dim_0, NAME_dim_1, … behind those of a point. Of the sources of an error only that
-    of sampling is known; NAME_ci95 is NaN for the others, and in total.
+    An array has the dimensions NAME_dim_0, NAME_dim_1, … behind those of a point. Of the sources of
+    an error only that of sampling is known; NAME_ci95 is NaN for the others, and in total.
     """
     if settings.observe is None:
         return {}
@@ -81,10 +114,16 @@ def own_variables(
             value[point], stderr[point] = values[name], stderrs[name]
         interval = np.full((*value.shape, len(ERROR_SOURCES)), np.nan)
         interval[..., ERROR_SOURCES.index("sampling")] = HALF_INTERVAL * stderr
-        about = {"long_name": f"mean of {name} over all time steps", "cell_methods": "realization: time: mean"}
+        about = {
+            "long_name": f"mean of {name} over all time steps",
+            "cell_methods": "realization: time: mean",
+        }
         variables[name] = grid.variable(value, about, *dims)
         about = {"long_name": f"standard error of the mean of {name}"}
         variables[f"{name}_stderr"] = grid.variable(stderr, about, *dims)
-        about = {"long_name": f"half-width of the 95 % interval of the mean of {name}, known for sampling only"}
+        about = {
+            "long_name": f"half-width of the 95 % interval of the mean of {name}, known for "
+            "sampling only"
+        }
         variables[f"{name}_ci95"] = grid.variable(interval, about, *dims, "error_source")
     return variables

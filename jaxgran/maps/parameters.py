@@ -1,10 +1,11 @@
 """The parameters of a map: one table, from which all else that knows them follows.
 
-A row is a field of ``MapParameters`` if the numbers of a map depend on it, and of ``RunParameters`` if it says how the
-map is run and kept. From the rows follow
+A row is a field of ``MapParameters`` if the numbers of a map depend on it, and of ``RunParameters``
+if it says how the map is run and kept. From the rows follow
 
 - the arguments of ``ratio_map``, with their defaults,
-- the options of ``jaxgran map`` and ``jaxgran run``, with their help, and the tables of the documentation,
+- the options of ``jaxgran map`` and ``jaxgran run``, with their help, and the tables of the
+  documentation,
 - the checks of ranges in ``MapSettings``,
 - the attributes of the dataset, which ``--resume`` and ``--from-map`` compare, and
 - the command on a page of a map that measures a point again.
@@ -38,7 +39,8 @@ class Option:
       values: whether the value itself is a list.
       auto: whether "auto" is accepted.
       unit: unit of the number, or "".
-      range: whether a number is accepted, and the same in words; None where ``ShearFlow`` checks it.
+      range: whether a number is accepted, and the same in words; None where ``ShearFlow`` checks
+        it.
       default: the default in words; None for the default of the field.
       commands: the commands that offer it; none for a parameter of Python only.
       short: one letter, or "".
@@ -79,18 +81,28 @@ class MapParameters:
         default=None, metadata=row("Restitution, 0 to 1.", several=True, default="of the preset")
     )
     packing_fraction: float | Sequence[float] = field(  # type: ignore[assignment]
-        default=None, metadata=row("Packing fraction, up to 0.83.", several=True, default="of the preset")
+        default=None,
+        metadata=row("Packing fraction, up to 0.83.", several=True, default="of the preset"),
     )
     _: KW_ONLY
     grains: int | Sequence[int] | Literal["auto"] = field(
         default=256,
-        metadata=row('Number of grains; "auto" chooses it for `error`.', int, several=True, auto=True, short="n"),
+        metadata=row(
+            'Number of grains; "auto" chooses it for `error`.',
+            int,
+            several=True,
+            auto=True,
+            short="n",
+        ),
     )
-    seeds: int = field(default=2, metadata=row("Independent runs of each point, averaged together.", int))
+    seeds: int = field(
+        default=2, metadata=row("Independent runs of each point, averaged together.", int)
+    )
     timestep: float | Sequence[float] | Literal["auto"] = field(
         default=1e-3,
         metadata=row(
-            'Time step of the sample; "auto" takes the longest one that changes the stresses of no point by more than '
+            'Time step of the sample; "auto" takes the longest one that changes the stresses of no '
+            "point by more than "
             "2 %, or a share of `error`.",
             several=True,
             auto=True,
@@ -100,16 +112,23 @@ class MapParameters:
     )
     equilibrate: float | None = field(
         default=None,
-        metadata=row("Strain before the sample.", range=_EQUILIBRATION, default="until the flow is steady"),
+        metadata=row(
+            "Strain before the sample.", range=_EQUILIBRATION, default="until the flow is steady"
+        ),
     )
     strain: float | None = field(
         default=None,
-        metadata=row("Sampled strain of each seed.", range=_POSITIVE, default="six correlation strains, at least 8"),
+        metadata=row(
+            "Sampled strain of each seed.",
+            range=_POSITIVE,
+            default="six correlation strains, at least 8",
+        ),
     )
     error: float | None = field(
         default=None,
         metadata=row(
-            "Relative error of force ratio and stresses to reach at every point, half of a 95 % interval: sets the "
+            "Relative error of force ratio and stresses to reach at every point, half of a 95 % "
+            "interval: sets the "
             "strain, and is the target of auto.",
             range=_ERROR,
         ),
@@ -124,10 +143,15 @@ class MapParameters:
     )
     solver: Any = field(
         default=None,
-        metadata=row("Projected method of the contact solve.", get_args(SolverName), default="barzilai-borwein"),
+        metadata=row(
+            "Projected method of the contact solve.",
+            get_args(SolverName),
+            default="barzilai-borwein",
+        ),
     )
     activation: Activation = field(
-        default="midpoint", metadata=row("When a pair of grains is a contact.", get_args(Activation))
+        default="midpoint",
+        metadata=row("When a pair of grains is a contact.", get_args(Activation)),
     )
     engine: Any = field(
         default=None,
@@ -140,7 +164,8 @@ class MapParameters:
     grains_by_point: Sequence[int] | None = field(
         default=None,
         metadata=row(
-            "Number of grains of each point, in the order of time steps, packing fractions and restitutions, the last "
+            "Number of grains of each point, in the order of time steps, packing fractions and "
+            "restitutions, the last "
             "one fastest; `grains` is then the largest.",
             int,
             commands=(),
@@ -156,12 +181,16 @@ class MapParameters:
         ),
     )
     first_seed: int = field(
-        default=0, metadata=row("Number of the first seed; seeds of other numbers start from other grains.", int)
+        default=0,
+        metadata=row(
+            "Number of the first seed; seeds of other numbers start from other grains.", int
+        ),
     )
     observe: Any = field(
         default=None,
         metadata=row(
-            "A function as in `sample` that returns numbers or arrays by name; each is averaged into a variable of "
+            "A function as in `sample` that returns numbers or arrays by name; each is averaged "
+            "into a variable of "
             "this name.",
             commands=(),
         ),
@@ -176,7 +205,8 @@ class MapParameters:
     diameters: Sequence[float] | None = field(
         default=None,
         metadata=row(
-            "Diameters of equally many grains each, such as 1,1.4, in place of the uniform distribution; their mean is "
+            "Diameters of equally many grains each, such as 1,1.4, in place of the uniform "
+            "distribution; their mean is "
             "the unit of length.",
             values=True,
         ),
@@ -184,7 +214,8 @@ class MapParameters:
     part: str | None = field(
         default=None,
         metadata=row(
-            "Measure one share of the points only, such as 3/20, the third of twenty of about the same cost; `jaxgran "
+            "Measure one share of the points only, such as 3/20, the third of twenty of about the "
+            "same cost; `jaxgran "
             "merge` joins their files.",
             str,
             commands=("map",),
@@ -195,10 +226,13 @@ class MapParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class RunParameters(MapParameters):
-    """All parameters of ``ratio_map``: what the numbers depend on, and how the map is run and kept."""
+    """All parameters of ``ratio_map``: what the numbers depend on, and how the map is run and
+    kept.
+    """
 
     preset: str = field(
-        default="quick", metadata=row("Starting point of all other parameters.", tuple(PRESETS), commands=("map",))
+        default="quick",
+        metadata=row("Starting point of all other parameters.", tuple(PRESETS), commands=("map",)),
     )
     from_map: str | Path | None = field(
         default=None,
@@ -212,12 +246,18 @@ class RunParameters(MapParameters):
 
     output: str | Path | None = field(
         default=None,
-        metadata=row("NetCDF file of the results, with all parameters.", Path, short="o", example="FILE.nc"),
+        metadata=row(
+            "NetCDF file of the results, with all parameters.", Path, short="o", example="FILE.nc"
+        ),
     )
-    overwrite: bool = field(default=False, metadata=row("Replace existing files, whatever they hold.", bool))
+    overwrite: bool = field(
+        default=False, metadata=row("Replace existing files, whatever they hold.", bool)
+    )
     resume: bool = field(
         default=False,
-        metadata=row("Continue an unfinished map of the output, or read the output if it is finished.", bool),
+        metadata=row(
+            "Continue an unfinished map of the output, or read the output if it is finished.", bool
+        ),
     )
     workers: int | None = field(
         default=None,
@@ -240,7 +280,8 @@ class RunParameters(MapParameters):
     progress: bool | Callable[[float], object] = field(
         default=False,
         metadata=row(
-            "Show progress on standard error, or a function that is called with the replica-steps done since its last "
+            "Show progress on standard error, or a function that is called with the replica-steps "
+            "done since its last "
             "call.",
             bool,
             commands=(),
@@ -248,7 +289,10 @@ class RunParameters(MapParameters):
     )
     record: Any = field(
         default=None,
-        metadata=row("Wraps the function that advances a sampled batch, such as that of a recorder.", commands=()),
+        metadata=row(
+            "Wraps the function that advances a sampled batch, such as that of a recorder.",
+            commands=(),
+        ),
     )
     attributes: dict[str, Any] | None = field(
         default=None, metadata=row("More attributes of the dataset.", commands=())
@@ -257,7 +301,9 @@ class RunParameters(MapParameters):
 
 def options(command: Command) -> dict[str, Option]:
     """The parameters that a command offers, by name."""
-    return {f.name: option(f.name) for f in fields(RunParameters) if command in option(f.name).commands}
+    return {
+        f.name: option(f.name) for f in fields(RunParameters) if command in option(f.name).commands
+    }
 
 
 def option(name: str) -> Option:
@@ -271,7 +317,9 @@ def default(name: str) -> Any:
 
 
 def takes(parameters: Callable[P, object]) -> Callable[[Callable[..., R]], Callable[P, R]]:
-    """Decorator: gives a function of any arguments the signature of a dataclass, and its table for ``{PARAMETERS}``."""
+    """Decorator: gives a function of any arguments the signature of a dataclass, and its table for
+    ``{PARAMETERS}``.
+    """
 
     def decorate(function: Callable[..., R]) -> Callable[P, R]:
         setattr(function, "__signature__", inspect.signature(parameters))  # noqa: B010

@@ -45,11 +45,18 @@ class PointGrid:
         return np.array([flow.grains for flow in self.flows])
 
     def variable(self, values: np.ndarray, attrs: Mapping[str, Any], *further: str) -> xr.Variable:
-        """A variable of values (points, ...) in the order of ``flows``; ``further`` are its last dims."""
-        return xr.Variable((*self.dims, *further), values.reshape(*self.shape, *values.shape[1:]), dict(attrs))
+        """A variable of values (points, ...) in the order of ``flows``; ``further`` are its last
+        dims.
+        """
+        return xr.Variable(
+            (*self.dims, *further), values.reshape(*self.shape, *values.shape[1:]), dict(attrs)
+        )
 
     def averages(
-        self, names: Iterable[str], values: Mapping[str, np.ndarray], stderrs: Mapping[str, np.ndarray] | None = None
+        self,
+        names: Iterable[str],
+        values: Mapping[str, np.ndarray],
+        stderrs: Mapping[str, np.ndarray] | None = None,
     ) -> dict[str, xr.Variable]:
         """The variables NAME and, where errors are given, NAME_stderr of some observables."""
         variables = {}
@@ -64,16 +71,19 @@ class PointGrid:
 
 
 class PointAverages(NamedTuple):
-    """Averages over the seeds of each point that were not given up, in the order of ``settings.flows()``, or NaN.
+    """Averages over the seeds of each point that were not given up, in the order of
+    ``settings.flows()``, or NaN.
 
-    ============================  ==============  =================================================================
+    ============================  ==============  ==================================================
     values, stderrs               (points, ...)   each observable and its standard error, by name
     correlation_strain            (points,)       strain over which the flow is correlated
-    observable_correlation        (points,)       strain of one independent sample, for averages of scalars, by name
-    friction_error_correlation    (points,)       of the errors of macroscopic_friction and inertial_number
+    observable_correlation        (points,)       strain of one independent sample, for averages of
+                                                  scalars, by name
+    friction_error_correlation    (points,)       of the errors of macroscopic_friction and
+                                                  inertial_number
     drifting                      (points,)       whether the averages still change
     samples                       by point        samples of these seeds
-    ============================  ==============  =================================================================
+    ============================  ==============  ==================================================
     """
 
     values: dict[str, np.ndarray]
@@ -105,7 +115,9 @@ def point_averages(settings: MapSettings, replicas: Mapping[Key, Replica | None]
             found.values[name][point], found.stderrs[name][point] = values[name], stderrs[name]
         mass = _mass(settings, flow)
         area, shear_rate = samples[0].area, samples[0].shear_rate
-        strain = found.correlation_strain[point] = flow_correlation_strain(values, flow.grains, mass, area, shear_rate)
+        strain = found.correlation_strain[point] = flow_correlation_strain(
+            values, flow.grains, mass, area, shear_rate
+        )
         found.drifting[point] = is_drifting(samples, float(strain))
         correlation = error_correlation_of(samples, "macroscopic_friction", "inertial_number")
         found.friction_error_correlation[point] = correlation
@@ -118,11 +130,19 @@ def point_averages(settings: MapSettings, replicas: Mapping[Key, Replica | None]
 def _mass(settings: MapSettings, flow: ShearFlow) -> float:
     """The mass of all grains of a flow, in m."""
     grains = settings.grains_of(flow.grains, 1)
-    return flow.grains * (1 + float(flow.polydispersity) ** 2 / 3) if grains is None else float(grains.masses.sum())
+    return (
+        flow.grains * (1 + float(flow.polydispersity) ** 2 / 3)
+        if grains is None
+        else float(grains.masses.sum())
+    )
 
 
-def _samples(settings: MapSettings, replicas: Mapping[Key, Replica | None]) -> dict[int, Sequence[Sample]]:
-    """The samples of each point that has any, in the order of the seeds, without those that were given up."""
+def _samples(
+    settings: MapSettings, replicas: Mapping[Key, Replica | None]
+) -> dict[int, Sequence[Sample]]:
+    """The samples of each point that has any, in the order of the seeds, without those that were
+    given up.
+    """
     by_point: dict[int, Sequence[Sample]] = {}
     for point in range(len(settings.flows())):
         seeds = [replicas.get((point, seed)) for seed in range(settings.seeds)]

@@ -1,6 +1,8 @@
-"""The parameters of a map: those of a preset or of a file, replaced by those that are given and what they imply.
+"""The parameters of a map: those of a preset or of a file, replaced by those that are given and
+what they imply.
 
-This module loads neither JAX nor xarray at once, as the help of the command line needs the names of the presets.
+This module loads neither JAX nor xarray at once, as the help of the command line needs the names of
+the presets.
 """
 
 import os
@@ -45,7 +47,9 @@ def with_start(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     preset, from_map = given.get("preset", "quick"), given.get("from_map")
     if not isinstance(preset, str) or preset not in PRESETS:
-        raise refused("preset", preset, f"must be {', '.join(list(PRESETS)[:-1])} or {list(PRESETS)[-1]}")
+        raise refused(
+            "preset", preset, f"must be {', '.join(list(PRESETS)[:-1])} or {list(PRESETS)[-1]}"
+        )
     if from_map is None:
         return combined(PRESETS[preset], given)
     if "preset" in given:
@@ -56,33 +60,52 @@ def with_start(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def combined(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters of a preset or a file, replaced by those that are given and by what these imply."""
+    """The parameters of a preset or a file, replaced by those that are given and by what these
+    imply.
+    """
     replaced = {
         "error": ("seeds", "strain"),
         "strain": ("error",),
         "polydispersity": ("diameters",),
         "diameters": ("polydispersity",),
     }
-    left_out = {name for option, names in replaced.items() if given.get(option) is not None for name in names}
+    left_out = {
+        name
+        for option, names in replaced.items()
+        if given.get(option) is not None
+        for name in names
+    }
     kept = {name: value for name, value in start.items() if name not in left_out}
-    if "grains_by_point" in kept and given.keys() & {"grains", "timestep", "restitution", "packing_fraction", "error"}:
+    if "grains_by_point" in kept and given.keys() & {
+        "grains",
+        "timestep",
+        "restitution",
+        "packing_fraction",
+        "error",
+    }:
         del kept["grains_by_point"]
         kept["grains"] = "auto"  # chosen again, for the points that are given
     return kept | for_error(given) | dict(given)
 
 
 def for_error(given: Mapping[str, Any]) -> dict[str, Any]:
-    """What a requested error implies unless it is given; a longer sample is cheaper than a second seed."""
+    """What a requested error implies unless it is given; a longer sample is cheaper than a second
+    seed.
+    """
     automatic = {"grains": "auto", "timestep": "auto", "seeds": 1}
     return automatic if given.get("error") is not None else {}
 
 
 def _parameters_of(file: Path) -> dict[str, Any]:
-    """The parameters of the map in a file; a warning names other differences that could change its numbers."""
+    """The parameters of the map in a file; a warning names other differences that could change its
+    numbers.
+    """
     from jaxgran.maps.results import choices_of, differences, open_map
 
     data = open_map(file)
     chosen, different = choices_of(data), differences(data)
     if different:
         warnings.warn(f"differs from {file}: {'; '.join(different)}.", stacklevel=4)
-    return chosen | {"tolerance": getattr(chosen["solver"], "tolerance", None)}  # also of another solver
+    return chosen | {
+        "tolerance": getattr(chosen["solver"], "tolerance", None)
+    }  # also of another solver

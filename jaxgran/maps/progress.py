@@ -1,4 +1,6 @@
-"""Progress of a map on standard error: points done, share of the work, replica-steps per second, time left."""
+"""Progress of a map on standard error: points done, share of the work, replica-steps per second,
+time left.
+"""
 
 import time
 from collections.abc import Iterable, Iterator
@@ -19,8 +21,9 @@ _MOST_STARTED = 0.95  # largest share that counts as done before a replica is fi
 class Meter:
     """How much of a map is done, reported on standard error: a bar on a terminal, lines elsewhere.
 
-    A finished replica counts by its cost. A running one counts by the cost of the strain it has been sheared so far, up
-    to ``_MOST_STARTED``, since the strain that it needs is not known in advance.
+    A finished replica counts by its cost. A running one counts by the cost of the strain it has
+    been sheared so far, up to ``_MOST_STARTED``, since the strain that it needs is not known in
+    advance.
 
     Args:
       settings: the map.
@@ -29,7 +32,9 @@ class Meter:
 
     def __init__(self, settings: MapSettings, quiet: bool):
         self.flows, self.quiet = settings.flows(), quiet
-        self.costs = [replica_cost(flow, settings.equilibrate, settings.strain) for flow in self.flows]
+        self.costs = [
+            replica_cost(flow, settings.equilibrate, settings.strain) for flow in self.flows
+        ]
         self.left = dict.fromkeys(points_of_part(settings), settings.seeds)
         self.running: dict[Key, float] = {}  # share of each replica that has been started
         self.total = sum(self.costs[point] for point in self.left) * settings.seeds
@@ -37,7 +42,11 @@ class Meter:
         self.start = self.last_line = time.perf_counter()
         self.console = Console(stderr=True, quiet=quiet)
         self.bar = Progress(
-            TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=self.console, transient=False
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TimeElapsedColumn(),
+            console=self.console,
+            transient=False,
         )
         self.task = self.bar.add_task("compiling", total=self.total)
 
@@ -46,7 +55,9 @@ class Meter:
         self.done_steps += float(np.sum(advance.steps))
         columns = np.asarray(advance.timestep).tolist(), np.asarray(advance.steps).tolist()
         for key, timestep, steps in zip(advance.keys, *columns, strict=True):
-            cost = steps * timestep * predicted_cost(self.flows[key[0]], timestep) / self.costs[key[0]]
+            cost = (
+                steps * timestep * predicted_cost(self.flows[key[0]], timestep) / self.costs[key[0]]
+            )
             self.running[key] = min(self.running.get(key, 0.0) + cost, _MOST_STARTED)
         self._show()
 
@@ -66,11 +77,15 @@ class Meter:
     @property
     def _cost_of_run(self) -> float:
         """Cost of the work of this run so far."""
-        return self.done_cost + sum(self.costs[point] * share for (point, _), share in self.running.items())
+        return self.done_cost + sum(
+            self.costs[point] * share for (point, _), share in self.running.items()
+        )
 
     def _show(self) -> None:
         if self.console.is_terminal:
-            self.bar.update(self.task, completed=self.resumed_cost + self._cost_of_run, description=self._line())
+            self.bar.update(
+                self.task, completed=self.resumed_cost + self._cost_of_run, description=self._line()
+            )
         elif time.perf_counter() - self.last_line > _SECONDS_BETWEEN_LINES:
             self.last_line = time.perf_counter()
             self.console.print(self._line(), highlight=False)
@@ -80,7 +95,9 @@ class Meter:
         points = sum(left == 0 for left in self.left.values())
         percent = 100 * (self.resumed_cost + done) / self.total
         left = (
-            _duration(seconds * max(self.total - self.resumed_cost - done, 0.0) / done) if done > 0 else "unknown time"
+            _duration(seconds * max(self.total - self.resumed_cost - done, 0.0) / done)
+            if done > 0
+            else "unknown time"
         )
         speed = f"{self.done_steps / seconds:.3g} replica-steps/s"
         return f"{points}/{len(self.left)} points, {percent:.0f} % done, {speed}, {left} left"

@@ -1,4 +1,6 @@
-"""What the numbers of a map were computed with: precision, device, platform, versions, and a hash of the sources."""
+"""What the numbers of a map were computed with: precision, device, platform, versions, and a hash
+of the sources.
+"""
 
 import os
 import platform
@@ -22,11 +24,16 @@ def made_with() -> dict[str, str]:
         "python": platform.python_version(),
         "commit": environment.commit(),
         "code_digest": sources_digest(),
-        **{f"version_{name.replace('-', '_')}": number for name, number in environment.versions(_PACKAGES).items()},
+        **{
+            f"version_{name.replace('-', '_')}": number
+            for name, number in environment.versions(_PACKAGES).items()
+        },
     }
 
 
 def versions_of(made: Mapping[str, str]) -> dict[str, str]:
-    """The versions and sources on which the numbers depend, of what ``made_with`` returns or a file has."""
+    """The versions and sources on which the numbers depend, of what ``made_with`` returns or a file
+    has.
+    """
     names = ("code_digest", *(f"version_{name}" for name in DECIDING))
     return {name: made[name] for name in names if name in made}

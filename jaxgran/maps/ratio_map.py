@@ -1,4 +1,6 @@
-"""The ratio map: a grid of restitutions and packing fractions, run in batches on all cores, as a dataset and a file."""
+"""The ratio map: a grid of restitutions and packing fractions, run in batches on all cores, as a
+dataset and a file.
+"""
 
 import inspect
 import os
@@ -40,29 +42,33 @@ _OF_RUN = (
 
 @takes(RunParameters)
 def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
-    """Force ratio, stresses and temperature over a grid of restitutions and packing fractions, with errors.
+    """Force ratio, stresses and temperature over a grid of restitutions and packing fractions, with
+    errors.
 
-    With ``output``, finished batches are kept in a folder beside it while the map runs: an unfinished map of the same
-    parameters is continued if ``resume`` is True and is an error otherwise, and a finished one is then read from its
-    file. A file with anything else is replaced only if ``overwrite`` is True. ``save_figures`` draws the figures of
-    ``jaxgran map``, and ``open_map`` reads the file.
+    With ``output``, finished batches are kept in a folder beside it while the map runs: an
+    unfinished map of the same parameters is continued if ``resume`` is True and is an error
+    otherwise, and a finished one is then read from its file. A file with anything else is replaced
+    only if ``overwrite`` is True. ``save_figures`` draws the figures of ``jaxgran map``, and
+    ``open_map`` reads the file.
 
     Args:
       {PARAMETERS}
 
     Returns:
-      The DataTree described in ``map_dataset``. It has all observables on (packing_fraction, restitution), with
-      standard errors. Lists of numbers of grains and of time steps add the dimensions grains and timestep in front. It
-      also has the status of each point, and all parameters as attributes.
+      The DataTree described in ``map_dataset``. It has all observables on (packing_fraction,
+      restitution), with standard errors. Lists of numbers of grains and of time steps add the
+      dimensions grains and timestep in front. It also has the status of each point, and all
+      parameters as attributes.
 
     Raises:
-      InputError: (a ValueError) a parameter is out of its range; the message says what is accepted. Or the output
-        belongs to another map, is unfinished, or is being written by another process.
-      Interrupted: (a KeyboardInterrupt) Ctrl-C ended the map; ``data`` is the finished part, which is also written to
-        the output, unless a finished map is there.
+      InputError: (a ValueError) a parameter is out of its range; the message says what is accepted.
+        Or the output belongs to another map, is unfinished, or is being written by another process.
+      Interrupted: (a KeyboardInterrupt) Ctrl-C ended the map; ``data`` is the finished part, which
+        is also written to the output, unless a finished map is there.
 
     Warns:
-      BadPoints: (a UserWarning) points have a bad status, or their samples are short; the message names them.
+      BadPoints: (a UserWarning) points have a bad status, or their samples are short; the message
+        names them.
 
     Examples:
       >>> data = ratio_map([0.9], [0.5], grains=16, seeds=1, strain=0.4, equilibrate=0.0)
@@ -78,14 +84,19 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
     workers = _workers(run)
     if automatic_choice:
         _tell(run, f"chosen: {automatic_choice}")
-    earlier, difference, finished = (None, "", False) if output is None else _earlier(output, settings)
+    earlier, difference, finished = (
+        (None, "", False) if output is None else _earlier(output, settings)
+    )
     if difference and not run.overwrite:
         raise InputError(
             f"output {short_repr(str(output))} already exists and has {difference}; "
             "pass `overwrite=True` to replace it.",
             field="output",
         )
-    checkpoint, complete = None if output is None else Checkpoint(output, settings, run.resume), False
+    checkpoint, complete = (
+        None if output is None else Checkpoint(output, settings, run.resume),
+        False,
+    )
     try:
         if checkpoint is not None and run.resume:
             started = checkpoint.done or checkpoint.journals()
@@ -94,7 +105,9 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
                 _tell(run, f"{output} is finished and is read from its file.")
                 return earlier
             _tell_resumed(run, settings, checkpoint)
-        results, attributes, interruption = _run(run, settings, workers, None if run.record else checkpoint)
+        results, attributes, interruption = _run(
+            run, settings, workers, None if run.record else checkpoint
+        )
         from jaxgran.maps.dataset import map_dataset  # here: xarray is loaded while the flows run
         from jaxgran.maps.results import write_dataset
 
@@ -107,7 +120,9 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
         complete = sum(replica is not None for replica in results.values()) == _count(settings)
     except OSError as error:
         if checkpoint is not None and checkpoint.done:
-            error.add_note(f"finished batches are in {checkpoint.folder}: make room and add `resume=True`")
+            error.add_note(
+                f"finished batches are in {checkpoint.folder}: make room and add `resume=True`"
+            )
         raise
     finally:
         if checkpoint is not None:
@@ -117,7 +132,9 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
 
 
 def _checked(run: RunParameters) -> Path | None:
-    """The output of a map; InputError if something cannot be accepted about how the map is run and kept."""
+    """The output of a map; InputError if something cannot be accepted about how the map is run and
+    kept.
+    """
     for name in ("overwrite", "resume"):
         require_flag(name, getattr(run, name))
     if run.workers is not None:
@@ -149,7 +166,9 @@ def _checked(run: RunParameters) -> Path | None:
 
 
 def _require_own_attributes(run: RunParameters, settings: MapSettings) -> None:
-    """Raise an InputError if the user's attributes have a name of the map's; only the command may be given."""
+    """Raise an InputError if the user's attributes have a name of the map's; only the command may
+    be given.
+    """
     if not set(run.attributes or {}) - {"command"}:
         return
     from jaxgran.maps.dataset import run_attributes
@@ -170,10 +189,15 @@ def _workers(run: RunParameters) -> int:
 
 
 def _earlier(output: Path, settings: MapSettings) -> tuple[Any, str, bool]:
-    """The map that the output has already, how it differs from one of these settings, and whether it is finished."""
+    """The map that the output has already, how it differs from one of these settings, and whether
+    it is finished.
+    """
     if not output.exists():
         return None, "", False
-    from jaxgran.maps.results import earlier_map, is_finished  # here, or every map would begin by loading xarray
+    from jaxgran.maps.results import (
+        earlier_map,
+        is_finished,
+    )  # here, or every map would begin by loading xarray
 
     data, difference = earlier_map(output, settings)
     return data, difference, data is not None and is_finished(data)
@@ -182,7 +206,9 @@ def _earlier(output: Path, settings: MapSettings) -> tuple[Any, str, bool]:
 def _run(
     run: RunParameters, settings: MapSettings, workers: int, checkpoint: Checkpoint | None
 ) -> tuple[dict[Key, Replica | None], dict[str, Any], BaseException | None]:
-    """Run what the checkpoint lacks; the results, attributes of the run, and the interruption that ended it."""
+    """Run what the checkpoint lacks; the results, attributes of the run, and the interruption that
+    ended it.
+    """
     from jaxgran.maps.progress import progress  # here: a worker of a cluster need not load Rich
 
     Thread(target=_load_meanwhile, args=(settings,), name="jaxgran-load").start()
@@ -199,7 +225,9 @@ def _run(
                 run.progress(float(np.sum(advance.steps)))
 
         made: Provenance = {}
-        running = run_replicas(settings, workers, report, checkpoint, run.scheduler, run.record, made)
+        running = run_replicas(
+            settings, workers, report, checkpoint, run.scheduler, run.record, made
+        )
         try:
             with closing(running):
                 for key, replica in running:
@@ -211,7 +239,10 @@ def _run(
             interruption = error
     seconds = perf_counter() - start
     attributes |= {name: "; ".join(values) for name, values in made.items()}
-    attributes |= {"wall_time_seconds": seconds, "replica_steps_per_second": meter.done_steps / seconds}
+    attributes |= {
+        "wall_time_seconds": seconds,
+        "replica_steps_per_second": meter.done_steps / seconds,
+    }
     return results, attributes, interruption
 
 
@@ -244,7 +275,8 @@ def _tell_resumed(run: RunParameters, settings: MapSettings, checkpoint: Checkpo
     under_way = len(checkpoint.journals())
     _tell(
         run,
-        f"continued: {len(checkpoint.done)} of {_count(settings)} replicas are done, {under_way} batches under way.",
+        f"continued: {len(checkpoint.done)} of {_count(settings)} replicas are done, {under_way} "
+        "batches under way.",
     )
     if checkpoint.damaged:
         _tell(run, f"damaged and computed again: {', '.join(checkpoint.damaged)}.")

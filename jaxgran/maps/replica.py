@@ -20,7 +20,9 @@ class Advance(NamedTuple):
 
 
 class Replica(NamedTuple):
-    """Result of one replica: its sample, its worst status, its strain before the sample, and maybe its last state."""
+    """Result of one replica: its sample, its worst status, its strain before the sample, and maybe
+    its last state.
+    """
 
     sample: Sample
     status: int

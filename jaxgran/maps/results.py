@@ -1,7 +1,8 @@
 """Write, read and compare the file of a map.
 
-A file ends in a SHA-256 checksum of its content, which other readers of NetCDF ignore. It is compared first, because
-the HDF5 library may never return from a damaged file. Files written by other programs have no checksum.
+A file ends in a SHA-256 checksum of its content, which other readers of NetCDF ignore. It is
+compared first, because the HDF5 library may never return from a damaged file. Files written by
+other programs have no checksum.
 """
 
 import hashlib
@@ -29,21 +30,24 @@ _DIGEST = hashlib.sha256().digest_size  # bytes
 def write_dataset(data: xr.DataTree, path: Path) -> None:
     """Write a map as NetCDF to a temporary file in the same folder, then rename it to ``path``."""
     path.parent.mkdir(parents=True, exist_ok=True)  # it may have been removed during a long run
-    no_fill = {node.path: {name: {"_FillValue": None} for name in node.coords} for node in data.subtree}  # as CF asks
+    no_fill = {
+        node.path: {name: {"_FillValue": None} for name in node.coords} for node in data.subtree
+    }  # as CF asks
     content = bytes(data.to_netcdf(engine="netcdf4", encoding=no_fill, write_inherited_coords=True))
     with atomic_write(path) as temporary:
         temporary.write_bytes(content + _MARK + hashlib.sha256(content).digest())
 
 
 def open_map(path: str | Path) -> xr.DataTree:
-    """The map of a file, loaded into memory: that of ``ratio_map(output=…)``, of ``jaxgran map`` or of ``to_netcdf``.
+    """The map of a file, loaded into memory: that of ``ratio_map(output=…)``, of ``jaxgran map`` or
+    of ``to_netcdf``.
 
     Args:
       path: the file.
 
     Raises:
-      InputError: (a ValueError) the file does not exist, cannot be read, is not a map, or has another version of the
-        format.
+      InputError: (a ValueError) the file does not exist, cannot be read, is not a map, or has
+        another version of the format.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise refused("path", path, "must be a file name")
@@ -53,11 +57,15 @@ def open_map(path: str | Path) -> xr.DataTree:
         data = xr.load_datatree(_whole(Path(path)), engine="netcdf4")
     except Exception as error:  # an incomplete file may fail in any way
         why = " ".join(str(error).split()).replace(": '<xarray-in-memory-read>'", "").rstrip(".")
-        raise InputError(f"{short_repr(str(path))} is not a NetCDF file that can be read: {why}.") from None
+        raise InputError(
+            f"{short_repr(str(path))} is not a NetCDF file that can be read: {why}."
+        ) from None
     problem = what_lacks(data, *RATIO, "status")
     if problem:
         raise InputError(f"{short_repr(str(path))} is not a ratio map: {problem}.")
-    if difference := other_version(short_repr(str(path)), data.attrs.get("format_version"), FORMAT_VERSION):
+    if difference := other_version(
+        short_repr(str(path)), data.attrs.get("format_version"), FORMAT_VERSION
+    ):
         raise InputError(difference)
     return data
 
@@ -74,10 +82,13 @@ def _whole(path: Path) -> bytes:
 def choices_of(data: xr.DataTree) -> dict[str, Any]:
     """The parameters of a map, as arguments of ``MapSettings``; InputError if one is missing.
 
-    Engine and solver are those that were requested, not those that ran. The solver of a user's own class is given by
-    its name and numbers, and what a user observes by names and a hash, as class and function are not in the file.
+    Engine and solver are those that were requested, not those that ran. The solver of a user's own
+    class is given by its name and numbers, and what a user observes by names and a hash, as class
+    and function are not in the file.
     """
-    from jaxgran.dynamics.engine import engine_named  # here, so that figures are drawn without loading JAX
+    from jaxgran.dynamics.engine import (
+        engine_named,
+    )  # here, so that figures are drawn without loading JAX
     from jaxgran.maps.settings import MapSettings
 
     chosen: dict[str, Any] = {}
@@ -85,7 +96,10 @@ def choices_of(data: xr.DataTree) -> dict[str, Any]:
         for field in fields(MapSettings):
             if field.name in ("solver", "engine", "tolerance"):
                 continue
-            attribute = next((name for name in (f"{field.name}_requested", field.name) if name in data.attrs), None)
+            attribute = next(
+                (name for name in (f"{field.name}_requested", field.name) if name in data.attrs),
+                None,
+            )
             if field.name in data.coords:  # one number where one of a list was selected
                 values = data.coords[field.name].values.tolist()
                 chosen[field.name] = tuple(values) if isinstance(values, list) else values
@@ -93,9 +107,14 @@ def choices_of(data: xr.DataTree) -> dict[str, Any]:
                 chosen[field.name] = np.asarray(data.attrs[attribute]).tolist()
             elif field.default is not None and field.name not in _SINCE:
                 raise KeyError(field.name)
-        chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
+        chosen["equilibrate"] = (
+            None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
+        )
         chosen["snapshots"] = bool(chosen["snapshots"])
-        chosen |= {"solver": _solver_of(data), "engine": engine_named(data.attrs["engine_requested"])}
+        chosen |= {
+            "solver": _solver_of(data),
+            "engine": engine_named(data.attrs["engine_requested"]),
+        }
         return chosen | {
             name: tuple(np.atleast_1d(chosen[name]).tolist())
             for name in ("restitution", "packing_fraction", "grains_by_point", "diameters")
@@ -113,11 +132,14 @@ def _solver_of(data: xr.DataTree) -> Any:
     try:
         return SOLVERS[name](**json.loads(numbers)) if name in SOLVERS else f"{name} {numbers}"
     except (TypeError, json.JSONDecodeError):
-        raise InputError(f"solver_parameters must be those of {name}, not {short_repr(numbers)}.") from None
+        raise InputError(
+            f"solver_parameters must be those of {name}, not {short_repr(numbers)}."
+        ) from None
 
 
 def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.DataTree | None, str]:
-    """The map that is in a file already, or None, and a description of what a map of these settings would replace.
+    """The map that is in a file already, or None, and a description of what a map of these settings
+    would replace.
 
     The description is "" if the file holds a map of the same settings.
     """
@@ -131,7 +153,9 @@ def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.DataTree | None
         return None, "something other than a map of this version"
     for field in fields(settings):
         there: Any = chosen.get(field.name, field.default)
-        here: Any = identity_of(settings) if field.name == "observe" else getattr(settings, field.name)
+        here: Any = (
+            identity_of(settings) if field.name == "observe" else getattr(settings, field.name)
+        )
         if isinstance(there, str) and field.name == "solver":
             here = solver_text(here)
         if there != here:
@@ -142,19 +166,27 @@ def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.DataTree | None
 def is_finished(data: xr.DataTree) -> bool:
     """Whether a map has all its replicas."""
     status = data["seeds"].status
-    flags = dict(zip(status.attrs["flag_meanings"].split(), status.attrs["flag_values"], strict=True))
+    flags = dict(
+        zip(status.attrs["flag_meanings"].split(), status.attrs["flag_values"], strict=True)
+    )
     missing = [flags[name] for name in ("not_run", "failed")]
-    chosen = np.isin(np.arange(data.status.size), data.attrs.get("part_points", range(data.status.size)))
+    chosen = np.isin(
+        np.arange(data.status.size), data.attrs.get("part_points", range(data.status.size))
+    )
     return not np.isin(status.values.reshape(chosen.size, -1)[chosen], missing).any()
 
 
 def differences(data: xr.DataTree) -> list[str]:
-    """Descriptions of the differences in versions, device and precision between a map and this process."""
+    """Descriptions of the differences in versions, device and precision between a map and this
+    process.
+    """
     from jaxgran.maps.provenance import made_with
 
     here = made_with()
     names = [
-        name for name in here if name.startswith("version_") or name in ("device", "precision", "commit", "code_digest")
+        name
+        for name in here
+        if name.startswith("version_") or name in ("device", "precision", "commit", "code_digest")
     ]
     return [
         f"{name.replace('_', ' ')} {data.attrs[name]} there, {here[name]} here"

@@ -1,7 +1,7 @@
 """Runs the replicas of a map, in batches: in threads of this process, or on a cluster.
 
-The random numbers of a replica depend on its seed and its point only. So results do not depend on the batches, their
-order or the number of workers.
+The random numbers of a replica depend on its seed and its point only. So results do not depend on
+the batches, their order or the number of workers.
 """
 
 import math
@@ -38,23 +38,29 @@ def run_replicas(
     record: AdvanceWrapper | None = None,
     made: Provenance | None = None,
 ) -> Generator[tuple[Key, Replica | None]]:
-    """Run every replica of a map and yield its key and result when its batch is done; None if it was given up.
+    """Run every replica of a map and yield its key and result when its batch is done; None if it
+    was given up.
 
     Args:
       settings: the map.
       workers: number of threads; more than one only on a CPU. See ``in_threads`` for how they end.
       report: called after each advance.
-      checkpoint: keeps the finished replicas. Replicas that it already has are neither run nor yielded.
-      scheduler: address of a Dask scheduler, whose workers run the batches instead of this process. They
-        keep journals if they can access the folder of the checkpoint. ``report`` is then called after whole batches.
-      record: wraps the function that advances a sampled batch, but not the one of its preparation. It has an effect
-        only with one worker, and each of its batches is one replica.
+      checkpoint: keeps the finished replicas. Replicas that it already has are neither run nor
+        yielded.
+      scheduler: address of a Dask scheduler, whose workers run the batches instead of this process.
+        They keep journals if they can access the folder of the checkpoint. ``report`` is then
+        called after whole batches.
+      record: wraps the function that advances a sampled batch, but not the one of its preparation.
+        It has an effect only with one worker, and each of its batches is one replica.
       made: receives what the workers of a cluster computed with.
     """
     tasks, flows = remaining_batches(settings, workers, checkpoint), settings.flows()
     if record is not None:  # a recorder follows one replica
         tasks = [[key] for task in tasks for key in task]
-    calls = [(settings, task, None if checkpoint is None else checkpoint.journal_path(task)) for task in tasks]
+    calls = [
+        (settings, task, None if checkpoint is None else checkpoint.journal_path(task))
+        for task in tasks
+    ]
     report = report or (lambda _: None)
     if scheduler is not None:
         outcomes = run_on_cluster(scheduler, _run_task, calls, made)
@@ -66,13 +72,17 @@ def run_replicas(
         for number, outcome in outcomes:
             if outcome is None:
                 lost = _points(settings, tasks[number])
-                warnings.warn(f"a batch has killed its workers too often: {lost} not measured.", stacklevel=2)
+                warnings.warn(
+                    f"a batch has killed its workers too often: {lost} not measured.", stacklevel=2
+                )
                 yield from ((key, None) for key in tasks[number])
                 continue
             if checkpoint is not None:
                 checkpoint.add(dict(outcome))
             if scheduler is not None:
-                keys, steps = zip(*((key, one.sample.tally.steps.sum()) for key, one in outcome), strict=True)
+                keys, steps = zip(
+                    *((key, one.sample.tally.steps.sum()) for key, one in outcome), strict=True
+                )
                 report(Advance(keys, [float(flows[point].timestep) for point, _ in keys], steps))
             yield from outcome
 
@@ -80,9 +90,15 @@ def run_replicas(
 def _points(settings: MapSettings, task: Sequence[Key]) -> str:
     """The points of a batch, each once, for a message."""
     flows = settings.flows()
-    points = dict.fromkeys((float(flows[p].restitution), float(flows[p].packing_fraction)) for p, _ in task)
-    size = f", {flows[task[0][0]].grains} grains" if "grains" in settings.axes else ""  # one for the whole batch
-    return ", ".join(f"(restitution {alpha:g}, packing fraction {nu:g}{size})" for alpha, nu in points)
+    points = dict.fromkeys(
+        (float(flows[p].restitution), float(flows[p].packing_fraction)) for p, _ in task
+    )
+    size = (
+        f", {flows[task[0][0]].grains} grains" if "grains" in settings.axes else ""
+    )  # one for the whole batch
+    return ", ".join(
+        f"(restitution {alpha:g}, packing fraction {nu:g}{size})" for alpha, nu in points
+    )
 
 
 def _run_task(
@@ -92,10 +108,14 @@ def _run_task(
     report: Callable[[Advance], None] | None = None,
     record: AdvanceWrapper | None = None,
 ) -> list[tuple[Key, Replica]]:
-    """Prepare and sample the replicas of one batch; a batch that does not fit into memory is halved."""
+    """Prepare and sample the replicas of one batch; a batch that does not fit into memory is
+    halved.
+    """
     advance = _reporting(task, report)
     try:
-        return _measured(settings, task, advance if journal is None else Journal(journal, task, advance), record)
+        return _measured(
+            settings, task, advance if journal is None else Journal(journal, task, advance), record
+        )
     except CorruptFile:
         assert journal is not None
         journal.unlink(missing_ok=True)
@@ -105,7 +125,9 @@ def _run_task(
             raise
         middle = len(task) // 2  # the halves have no journal: it is that of the whole batch
         return [
-            done for half in (task[:middle], task[middle:]) for done in _run_task(settings, half, None, report, record)
+            done
+            for half in (task[:middle], task[middle:])
+            for done in _run_task(settings, half, None, report, record)
         ]
 
 
@@ -123,18 +145,31 @@ def _key(seed: Array, point: Array) -> UInt32[Array, "2"]:
 
 
 def _measured(
-    settings: MapSettings, task: Sequence[Key], advance: ObserveBatch, record: AdvanceWrapper | None = None
+    settings: MapSettings,
+    task: Sequence[Key],
+    advance: ObserveBatch,
+    record: AdvanceWrapper | None = None,
 ) -> list[tuple[Key, Replica]]:
     """Prepare and sample the replicas of a batch."""
     flows = settings.flows()
     flow = stack([flows[point] for point, _ in task])
-    keys = jax.device_put(np.stack([_key(settings.first_seed + seed, point) for point, seed in task]))
+    keys = jax.device_put(
+        np.stack([_key(settings.first_seed + seed, point) for point, seed in task])
+    )
     grains = settings.grains_of(flow.grains, len(task))
-    batch = prepare_batch(flow, keys, settings.equilibrate, advance, grains=grains, numerics=settings.numerics)
+    batch = prepare_batch(
+        flow, keys, settings.equilibrate, advance, grains=grains, numerics=settings.numerics
+    )
     strain_before = batch.strain
-    error = None if settings.error is None else sampling_error(settings.error) * math.sqrt(settings.seeds)
+    error = (
+        None
+        if settings.error is None
+        else sampling_error(settings.error) * math.sqrt(settings.seeds)
+    )
     sampling = advance if settings.observe is None else partial(advance, observe=settings.observe)
-    batch, sample = sample_batch(batch, settings.strain, sampling if record is None else record(sampling), error)
+    batch, sample = sample_batch(
+        batch, settings.strain, sampling if record is None else record(sampling), error
+    )
     states = [None] * len(task)
     if settings.snapshots:
         whole = jax.tree.map(np.asarray, batch.state)

@@ -1,7 +1,8 @@
-"""The groups and names in the data of a map: checks before they are drawn or fitted, and selections.
+"""The groups and names in the data of a map: checks before they are drawn or fitted, and
+selections.
 
-The data of a map are a DataTree. Functions that read it also accept a Dataset, such as its root alone, or a selection
-that has been flattened.
+The data of a map are a DataTree. Functions that read it also accept a Dataset, such as its root
+alone, or a selection that has been flattened.
 """
 
 from __future__ import annotations
@@ -26,13 +27,15 @@ ERROR_SOURCES = ("total", "sampling", "timestep", "size", "tolerance")
 """Coordinate of ``NAME_ci95``."""
 
 FINEST: dict[str, Callable[[list], float]] = {"grains": max, "timestep": min}
-"""Optional dimensions of a map, each with the function that picks the value of the smallest errors."""
+"""Optional dimensions of a map, with the functions that pick the value of the smallest errors."""
 
 _AXES = ("packing_fraction", "restitution")
 
 
 def require_map(data: Any, *names: str) -> xr.Dataset:
-    """The data of a map, flattened; InputError if they are not a ratio map with the named variables."""
+    """The data of a map, flattened; InputError if they are not a ratio map with the named
+    variables.
+    """
     problem = what_lacks(data, *names)
     if problem:
         raise InputError(f"data must be a ratio map, and {problem}.")
@@ -40,14 +43,20 @@ def require_map(data: Any, *names: str) -> xr.Dataset:
 
 
 def flattened(data: MapData) -> xr.Dataset:
-    """The variables of all groups in one Dataset, those of the root as ``NAME``, others as ``GROUP/NAME``."""
+    """The variables of all groups in one Dataset, those of the root as ``NAME``, others as
+    ``GROUP/NAME``.
+    """
     if isinstance(data, xr.Dataset):
         return data
     flat = data.to_dataset()
     for node in data.descendants:
         own = node.to_dataset(inherit=False)
-        flat = flat.assign_coords({name: x for name, x in own.coords.variables.items() if name not in flat.coords})
-        flat = flat.assign({f"{node.path[1:]}/{name}": own.variables[name] for name in own.data_vars})
+        flat = flat.assign_coords(
+            {name: x for name, x in own.coords.variables.items() if name not in flat.coords}
+        )
+        flat = flat.assign(
+            {f"{node.path[1:]}/{name}": own.variables[name] for name in own.data_vars}
+        )
     return flat
 
 
@@ -58,7 +67,9 @@ def path_of(observable: str) -> str:
 
 
 def what_lacks(data: Any, *names: str) -> str:
-    """Why data are not a ratio map with the named variables, as the end of a sentence; "" if they are one."""
+    """Why data are not a ratio map with the named variables, as the end of a sentence; "" if they
+    are one.
+    """
     if not isinstance(data, MapData):
         return f"this is a {type(data).__name__}"
     data = flattened(data)
@@ -69,23 +80,35 @@ def what_lacks(data: Any, *names: str) -> str:
         if name in data.coords and name in (*_AXES, *data.dims):
             axis = data[name]
             numeric = axis.dtype.kind in "iuf" and axis.dims == (name,) and axis.size > 0
-            if not numeric or not np.isfinite(axis.values).all() or np.unique(axis.values).size < axis.size:
+            if (
+                not numeric
+                or not np.isfinite(axis.values).all()
+                or np.unique(axis.values).size < axis.size
+            ):
                 return f"its {name} is not a list of different numbers"
     for name in (*names, *(("status",) if "status" in data else ())):
         variable = data[name]
         further = set(variable.dims) - {*_AXES, *FINEST}
-        on_axes = set(_AXES) <= set(variable.dims) and further in (set(), {*TENSOR_AXES}, {"error_source"})
+        on_axes = set(_AXES) <= set(variable.dims) and further in (
+            set(),
+            {*TENSOR_AXES},
+            {"error_source"},
+        )
         if variable.dtype.kind not in "iuf" or not on_axes:
             return f"its {name} is not a number at every packing_fraction and restitution"
     if "status" in data and "force_ratio" in names:  # figures of the force ratio show the status
-        flags = data.status.attrs.get("flag_values", ()), str(data.status.attrs.get("flag_meanings", "")).split()
+        flags = (
+            data.status.attrs.get("flag_values", ()),
+            str(data.status.attrs.get("flag_meanings", "")).split(),
+        )
         if np.size(flags[0]) == 0 or np.size(flags[0]) != len(flags[1]):
             return "its status has no flag_values and flag_meanings"
     return ""
 
 
 def finest(data: MapData, *names: str) -> xr.Dataset:
-    """A map at its largest number of grains and its shortest time step, flattened; these become its attributes.
+    """A map at its largest number of grains and its shortest time step, flattened; these become its
+    attributes.
 
     If names of these dimensions are given, the others remain.
     """
@@ -100,17 +123,25 @@ def finest(data: MapData, *names: str) -> xr.Dataset:
 
 
 def parts(data: MapData) -> list[xr.Dataset]:
-    """The parts of a map for each number of grains and time step, flattened; these become attributes of the part."""
+    """The parts of a map for each number of grains and time step, flattened; these become
+    attributes of the part.
+    """
     found = [flattened(data)]
     for name in FINEST:
         if name in found[0].dims:
             values = found[0][name].values.tolist()
-            found = [part.isel({name: k}).assign_attrs({name: x}) for part in found for k, x in enumerate(values)]
+            found = [
+                part.isel({name: k}).assign_attrs({name: x})
+                for part in found
+                for k, x in enumerate(values)
+            ]
     return found
 
 
 def relative_ci95(data: MapData, name: str) -> dict[str, np.ndarray]:
-    """Half-width of the 95 % interval of an average over the average, at every point, by the source of the error."""
+    """Half-width of the 95 % interval of an average over the average, at every point, by the source
+    of the error.
+    """
     data = flattened(data)
     with np.errstate(invalid="ignore", divide="ignore"):
         share = data[f"{name}_ci95"] / np.abs(data[name])
@@ -118,6 +149,11 @@ def relative_ci95(data: MapData, name: str) -> dict[str, np.ndarray]:
 
 
 def shear_stress_ratio(data: MapData) -> tuple[xr.DataArray, xr.DataArray]:
-    """Contact over binary shear stress, and its standard error: component xy of the ratio of the stresses."""
-    value, stderr = (flattened(data)[name].isel(axis_a=0, axis_b=1) for name in ("stress_ratio", "stress_ratio_stderr"))
+    """Contact over binary shear stress, and its standard error: component xy of the ratio of the
+    stresses.
+    """
+    value, stderr = (
+        flattened(data)[name].isel(axis_a=0, axis_b=1)
+        for name in ("stress_ratio", "stress_ratio_stderr")
+    )
     return value, stderr

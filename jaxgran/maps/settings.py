@@ -16,7 +16,14 @@ from jaxgran.contact.projected_methods import DEFAULT_SOLVER, require_solver
 from jaxgran.dynamics.engine import Numerics, checked_numerics, select_engine
 from jaxgran.maps.own_observables import require_observe
 from jaxgran.maps.parameters import MapParameters, default
-from jaxgran.model.checks import InputError, refused, require_flag, require_number, require_whole, two_digits
+from jaxgran.model.checks import (
+    InputError,
+    refused,
+    require_flag,
+    require_number,
+    require_whole,
+    two_digits,
+)
 from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains, own_grains
@@ -35,10 +42,12 @@ _SAFE: dict[str, Any] = {"grains": 256, "timestep": 1e-6}  # all flows accept th
 
 @dataclass(frozen=True)
 class MapSettings(MapParameters):
-    """The parameters that the numbers of a map depend on, checked, without "auto", and with tuples for lists.
+    """The parameters that the numbers of a map depend on, checked, without "auto", and with tuples
+    for lists.
 
-    ``solver`` and ``engine`` are values, see ``ProjectedMethod`` and ``dynamics.engine``; None stands for the default
-    solver and for the automatic choice of an engine. A given ``tolerance`` becomes that of the solver.
+    ``solver`` and ``engine`` are values, see ``ProjectedMethod`` and ``dynamics.engine``; None
+    stands for the default solver and for the automatic choice of an engine. A given ``tolerance``
+    becomes that of the solver.
     """
 
     if TYPE_CHECKING:
@@ -52,7 +61,13 @@ class MapSettings(MapParameters):
         for name, values in self.axes.items():
             _require_axis(name, values)
         require_whole("seeds", self.seeds, 1, MAX_REPLICAS, "the most replicas of a map")
-        require_whole("first_seed", self.first_seed, 0, _LARGEST_SEED, "to fit into 32 bits with all that follow")
+        require_whole(
+            "first_seed",
+            self.first_seed,
+            0,
+            _LARGEST_SEED,
+            "to fit into 32 bits with all that follow",
+        )
         require_flag("snapshots", self.snapshots)
         plane = len(self.packing_fraction) * len(self.restitution)
         self._require_grains_by_point(len(self._timesteps) * plane)
@@ -60,7 +75,9 @@ class MapSettings(MapParameters):
         count = math.prod(map(len, self.axes.values())) * self.seeds
         if count > MAX_REPLICAS:
             raise InputError(
-                f"a map must have at most {MAX_REPLICAS} replicas, points times seeds, not {count}.", field="seeds"
+                f"a map must have at most {MAX_REPLICAS} replicas, points times seeds, "
+                f"not {count}.",
+                field="seeds",
             )
         for row in fields(MapParameters):
             value, ranged = getattr(self, row.name), row.metadata["option"].range
@@ -73,19 +90,24 @@ class MapSettings(MapParameters):
             require_observe(self.observe, self._checked_flows()[0])
         shortest, longest = min(self._timesteps), max(self._timesteps)
         if shortest < SHORTEST_TIMESTEP:
-            raise refused("timestep", shortest, f"must be at least {SHORTEST_TIMESTEP:g} / shear rate")
+            raise refused(
+                "timestep", shortest, f"must be at least {SHORTEST_TIMESTEP:g} / shear rate"
+            )
         strain = LEAST_SAMPLE if self.strain is None else self.strain
         if strain > MAX_STEPS * shortest:
             most = f"{MAX_STEPS} time steps, that is {MAX_STEPS * shortest:g}"
             raise refused("strain", strain, f"must be at most {most}")
-        limits = longest_timestep(_temperature(self, flows), flows.packing_fraction, self.activation)
+        limits = longest_timestep(
+            _temperature(self, flows), flows.packing_fraction, self.activation
+        )
         excess = np.asarray(flows.timestep) / limits
         worst = int(np.argmax(excess))
         if excess[worst] > 1:
             raise refused(
                 "timestep",
                 float(np.asarray(flows.timestep)[worst]),
-                f"must be at most {two_digits(limits[worst], up=False)} at {_point(flows, worst)} to avoid deep "
+                f"must be at most {two_digits(limits[worst], up=False)} at {_point(flows, worst)} "
+                "to avoid deep "
                 "overlaps, or auto",
             )
         if round(strain / longest) < _FEWEST_STEPS:
@@ -100,7 +122,10 @@ class MapSettings(MapParameters):
         """
         optional: dict[str, Any] = {"grains": self.grains, "timestep": self.timestep}
         lists = {name: values for name, values in optional.items() if isinstance(values, tuple)}
-        plane: dict[str, Any] = {"packing_fraction": self.packing_fraction, "restitution": self.restitution}
+        plane: dict[str, Any] = {
+            "packing_fraction": self.packing_fraction,
+            "restitution": self.restitution,
+        }
         return lists | plane
 
     @property
@@ -122,20 +147,32 @@ class MapSettings(MapParameters):
     def require_engine(self) -> None:
         """Raise an InputError if the engine that is asked for cannot run this map here."""
         if self.engine is not None:
-            select_engine(self.flows()[0], self.numerics, option="" if self.observe is None else "observe")
+            select_engine(
+                self.flows()[0], self.numerics, option="" if self.observe is None else "observe"
+            )
 
     def _require_grains_by_point(self, points: int) -> None:
-        """Raise an InputError unless grains by point are given for all points, and not as a list too."""
+        """Raise an InputError unless grains by point are given for all points, and not as a list
+        too.
+        """
         values = self.grains_by_point
         listed = isinstance(values, tuple) and len(values) == points and _are_numbers(values)
         if values is not None and (not listed or "grains" in self.axes):
-            raise refused("grains_by_point", values, f"must be a list of {points} numbers, one for each point")
+            raise refused(
+                "grains_by_point", values, f"must be a list of {points} numbers, one for each point"
+            )
 
     def _sort_plane(self) -> None:
-        """Put restitutions and packing fractions, and the grains of their points, in ascending order."""
+        """Put restitutions and packing fractions, and the grains of their points, in ascending
+        order.
+        """
         if self.grains_by_point is not None:
-            by_point = np.reshape(self.grains_by_point, (-1, len(self.packing_fraction), len(self.restitution)))
-            by_point = by_point[:, np.argsort(self.packing_fraction)][..., np.argsort(self.restitution)]
+            by_point = np.reshape(
+                self.grains_by_point, (-1, len(self.packing_fraction), len(self.restitution))
+            )
+            by_point = by_point[:, np.argsort(self.packing_fraction)][
+                ..., np.argsort(self.restitution)
+            ]
             object.__setattr__(self, "grains_by_point", tuple(by_point.ravel().tolist()))
         for name in ("restitution", "packing_fraction"):
             object.__setattr__(self, name, tuple(sorted(getattr(self, name))))
@@ -158,22 +195,32 @@ class MapSettings(MapParameters):
     def _require_part(self) -> None:
         if self.part is None:
             return
-        found = re.fullmatch(r"([1-9]\d{0,5})/([1-9]\d{0,5})", self.part) if isinstance(self.part, str) else None
+        found = (
+            re.fullmatch(r"([1-9]\d{0,5})/([1-9]\d{0,5})", self.part)
+            if isinstance(self.part, str)
+            else None
+        )
         points = math.prod(map(len, self.axes.values()))
         if found is None or not int(found[1]) <= int(found[2]) <= points:
             raise refused(
-                "part", self.part, f"must be K/N with K at most N, and N at most {points}, the number of points"
+                "part",
+                self.part,
+                f"must be K/N with K at most N, and N at most {points}, the number of points",
             )
 
     def grains_of(self, size: int, replicas: int) -> Grains | None:
-        """The discs (replicas, size) that a flow is given; None where their diameters are uniform."""
+        """The discs (replicas, size) that a flow is given; None where their diameters are
+        uniform.
+        """
         if self.diameters is None:
             return None
         discs = own_grains(np.resize(self.diameters, size))
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (replicas, size)), discs)
 
     def size_classes(self, replicas: int) -> Grains | None:
-        """Discs in the proportions of the given diameters, for kinetic theory; None where diameters are uniform."""
+        """Discs in the proportions of the given diameters, for kinetic theory; None where diameters
+        are uniform.
+        """
         return None if self.diameters is None else self.grains_of(8 * len(self.diameters), replicas)
 
     def flows(self) -> list[ShearFlow]:
@@ -186,7 +233,9 @@ class MapSettings(MapParameters):
         if self.grains_by_point is None:
             numbers = [(grains, *point) for grains in self.sizes for point in points]
         else:
-            numbers = [(grains, *point) for grains, point in zip(self.grains_by_point, points, strict=True)]
+            numbers = [
+                (grains, *point) for grains, point in zip(self.grains_by_point, points, strict=True)
+            ]
         return [
             ShearFlow(
                 grains=grains,
@@ -202,14 +251,20 @@ class MapSettings(MapParameters):
 
 @lru_cache(maxsize=4)
 def _flows(settings: MapSettings) -> tuple[ShearFlow, ...]:
-    """The flows of a map, kept for its batches: a map of thousands of points has hundreds of batches."""
+    """The flows of a map, kept for its batches: a map of thousands of points has hundreds of
+    batches.
+    """
     return tuple(settings._checked_flows())
 
 
 def stack_of_any_size(flows: Sequence[ShearFlow]) -> ShearFlow:
-    """The flows as one batch at their largest number of grains, for what does not depend on this number."""
+    """The flows as one batch at their largest number of grains, for what does not depend on this
+    number.
+    """
     largest = max(flow.grains for flow in flows)
-    return stack([flow if flow.grains == largest else replace(flow, grains=largest) for flow in flows])
+    return stack(
+        [flow if flow.grains == largest else replace(flow, grains=largest) for flow in flows]
+    )
 
 
 def chosen_settings(asked: MapParameters) -> tuple[MapSettings, str]:
@@ -218,21 +273,31 @@ def chosen_settings(asked: MapParameters) -> tuple[MapSettings, str]:
     With an ``error``, the grains are chosen for each point, and the time step for its share of it.
 
     Raises:
-      InputError: (a ValueError) a parameter is out of its range, or the error needs too many grains.
+      InputError: (a ValueError) a parameter is out of its range, or the error needs too many
+        grains.
     """
     rows = fields(MapParameters)
-    chosen: dict[str, Any] = {one.name: _plain(getattr(asked, one.name), one.metadata["option"].kind) for one in rows}
+    chosen: dict[str, Any] = {
+        one.name: _plain(getattr(asked, one.name), one.metadata["option"].kind) for one in rows
+    }
     for name in ("restitution", "packing_fraction"):
         if _are_numbers((chosen[name],)):
             chosen[name] = (chosen[name],)
     by_point = chosen["grains_by_point"]
-    if isinstance(by_point, tuple) and by_point and all(isinstance(grains, int) for grains in by_point):
+    if (
+        isinstance(by_point, tuple)
+        and by_point
+        and all(isinstance(grains, int) for grains in by_point)
+    ):
         chosen["grains"] = max(by_point)
     automatic = {name for name in _SAFE if isinstance(chosen[name], str) and chosen[name] == "auto"}
     if not automatic:
         return MapSettings(**chosen), ""
     checked = MapSettings(**{**chosen, **{name: _SAFE[name] for name in automatic}, "strain": None})
-    chosen |= {name: getattr(checked, name) for name in ("restitution", "packing_fraction", "grains_by_point")}
+    chosen |= {
+        name: getattr(checked, name)
+        for name in ("restitution", "packing_fraction", "grains_by_point")
+    }
     target = _AUTOMATIC_ERROR if checked.error is None else SHARES["timestep"] * checked.error
     notes = []
     if "grains" in automatic:
@@ -244,14 +309,20 @@ def chosen_settings(asked: MapParameters) -> tuple[MapSettings, str]:
         notes.append(f"{sizes} grains, {checked.seeds} seed{'s' if checked.seeds > 1 else ''}")
     if "timestep" in automatic:
         flows = stack_of_any_size(replace(checked, timestep=_SAFE["timestep"], strain=1.0).flows())
-        steps = automatic_timestep(_temperature(checked, flows), flows.packing_fraction, checked.activation, target)
+        steps = automatic_timestep(
+            _temperature(checked, flows), flows.packing_fraction, checked.activation, target
+        )
         if isinstance(chosen["strain"], int | float):
             steps = np.minimum(steps, chosen["strain"] / _FEWEST_STEPS)
         shortest = int(np.argmin(steps))  # one for all points, so that their force ratios compare
         chosen["timestep"] = float(two_digits(steps[shortest], up=False))
-        notes.append(f"timestep {chosen['timestep']:g} / shear rate, which {_point(flows, shortest)} needs")
+        notes.append(
+            f"timestep {chosen['timestep']:g} / shear rate, which {_point(flows, shortest)} needs"
+        )
     aim = f"{target:g} from the time step" if checked.error is None else f"{checked.error:g}"
-    return MapSettings(**chosen), f"{'; '.join(notes)}: for a relative error of {aim} in the stresses."
+    return MapSettings(
+        **chosen
+    ), f"{'; '.join(notes)}: for a relative error of {aim} in the stresses."
 
 
 def _grains_for(settings: MapSettings, error: float) -> tuple[int, ...]:
@@ -261,7 +332,10 @@ def _grains_for(settings: MapSettings, error: float) -> tuple[int, ...]:
     if max(grains) > MAX_GRAINS:
         surely = MAX_GRAINS / 2**0.5  # numbers of grains are chosen in steps of √2
         least = max(float(size_error(alpha, nu, surely)) for nu, alpha in points) / SHARES["size"]
-        reason = f"must be at least {two_digits(least, up=True)} at these points, to need at most {MAX_GRAINS} grains"
+        reason = (
+            f"must be at least {two_digits(least, up=True)} at these points, to need at most "
+            f"{MAX_GRAINS} grains"
+        )
         raise refused("error", error, reason)
     return tuple(grains) * len(settings._timesteps)
 
@@ -286,16 +360,22 @@ def _require_axis(name: str, values: Any) -> None:
 
 
 def _are_numbers(values: tuple) -> bool:
-    return all(isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) for x in values)
+    return all(
+        isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool)
+        for x in values
+    )
 
 
 def _plain(value: Any, kind: Any) -> Any:
-    """A number as a Python number, a list or array of numbers as a tuple; ``MapSettings`` checks all other values.
+    """A number as a Python number, a list or array of numbers as a tuple; ``MapSettings`` checks
+    all other values.
 
     Whole numbers of a list become floats unless ``kind`` is int.
     """
     try:
-        if isinstance(value, np.ma.MaskedArray) or (isinstance(value, Sequence) and len(value) > MAX_REPLICAS):
+        if isinstance(value, np.ma.MaskedArray) or (
+            isinstance(value, Sequence) and len(value) > MAX_REPLICAS
+        ):
             return value
         array = np.asarray(value)
     except (TypeError, ValueError):  # a random key, or lists of different lengths
@@ -307,7 +387,9 @@ def _plain(value: Any, kind: Any) -> Any:
 
 def _temperature(settings: MapSettings, flows: ShearFlow) -> np.ndarray:
     """Expected granular temperature of each flow, in mσ²/t²."""
-    theory = predicted(flows, settings.size_classes(np.size(flows.restitution))).granular_temperature
+    theory = predicted(
+        flows, settings.size_classes(np.size(flows.restitution))
+    ).granular_temperature
     return expected_temperature(theory, flows.packing_fraction, flows.shear_rate)
 
 

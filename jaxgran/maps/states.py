@@ -1,4 +1,6 @@
-"""The last state of each point of a map with ``snapshots``, from which its contacts and forces are computed."""
+"""The last state of each point of a map with ``snapshots``, from which its contacts and forces are
+computed.
+"""
 
 import math
 from collections.abc import Mapping
@@ -25,7 +27,10 @@ _OF_GRAINS = {
     "radii": ("radius of a grain", "sigma", ("grain",)),
     "masses": ("mass of a grain", "m", ("grain",)),
 }
-_OF_CELL = {"side": ("side of the cell", "sigma", ()), "tilt": ("offset of the image row above, in sides", "1", ())}
+_OF_CELL = {
+    "side": ("side of the cell", "sigma", ()),
+    "tilt": ("offset of the image row above, in sides", "1", ()),
+}
 VARIABLES: dict[str, tuple[str, str, tuple[str, ...]]] = _OF_GRAINS | _OF_CELL
 """Long name, unit and further dimensions of the variables of the group ``states``."""
 
@@ -41,7 +46,8 @@ def first_of_points(replicas: Mapping[Key, Replica | None]) -> dict[int, State]:
 
 
 def state_variables(grid: PointGrid, states: Mapping[int, State]) -> dict[str, xr.Variable]:
-    """The group ``states``: the fields of a ``State`` by point; NaN for points without one, and after the last grain.
+    """The group ``states``: the fields of a ``State`` by point; NaN for points without one, and
+    after the last grain.
 
     Args:
       grid: the dimensions of a point.
@@ -72,10 +78,18 @@ def state_of(here: Mapping[str, np.ndarray], dtype: Any = float) -> State | None
 
 
 def states_of(data: xr.Dataset, count: int, dtype: Any = float) -> dict[int, State]:
-    """The states in the group ``states`` of a map of ``count`` points, by the number of the point."""
+    """The states in the group ``states`` of a map of ``count`` points, by the number of the
+    point.
+    """
     values = {name: data[name].values for name in VARIABLES}
-    values = {name: x.reshape(count, *x.shape[x.ndim - len(VARIABLES[name][2]) :]) for name, x in values.items()}
-    found = {point: state_of({name: x[point] for name, x in values.items()}, dtype) for point in range(count)}
+    values = {
+        name: x.reshape(count, *x.shape[x.ndim - len(VARIABLES[name][2]) :])
+        for name, x in values.items()
+    }
+    found = {
+        point: state_of({name: x[point] for name, x in values.items()}, dtype)
+        for point in range(count)
+    }
     return {point: one for point, one in found.items() if one is not None}
 
 
@@ -83,12 +97,19 @@ _snapshot = jax.jit(snapshot)
 
 
 def instant_at(
-    state: State, restitution: float, packing_fraction: float, timestep: float, activation: Activation
+    state: State,
+    restitution: float,
+    packing_fraction: float,
+    timestep: float,
+    activation: Activation,
 ) -> Instant | None:
-    """The grains of a state, and the forces of the time step that begins with it, by the default solver.
+    """The grains of a state, and the forces of the time step that begins with it, by the default
+    solver.
 
     None where contacts may be missing or have no solution.
     """
-    flow = ShearFlow(len(state.grains.radii), restitution, packing_fraction, timestep, activation=activation)
+    flow = ShearFlow(
+        len(state.grains.radii), restitution, packing_fraction, timestep, activation=activation
+    )
     now = _snapshot(flow, state)
     return None if now.status >= Status.infeasible else instant_of(now)

@@ -1,4 +1,6 @@
-"""What went wrong at the points of a map: sentences for the command line and for the warnings of ``ratio_map``."""
+"""What went wrong at the points of a map: sentences for the command line and for the warnings of
+``ratio_map``.
+"""
 
 import math
 
@@ -18,12 +20,20 @@ class BadPoints(UserWarning):
 def bad_points(data: MapData) -> dict[str, list[str]]:
     """Descriptions of the points whose status is not ok, by the name of the status."""
     names = dict(
-        zip(data.status.attrs["flag_values"].tolist(), data.status.attrs["flag_meanings"].split(), strict=True)
+        zip(
+            data.status.attrs["flag_values"].tolist(),
+            data.status.attrs["flag_meanings"].split(),
+            strict=True,
+        )
     )
     bad: dict[str, list[str]] = {}
     if "part_points" in data.attrs:  # the other points are those of other parts
-        own = np.isin(np.arange(data.status.size), data.attrs["part_points"]).reshape(data.status.shape)
-        data = flattened(data).assign(status=data.status.where(own, 0).assign_attrs(data.status.attrs))
+        own = np.isin(np.arange(data.status.size), data.attrs["part_points"]).reshape(
+            data.status.shape
+        )
+        data = flattened(data).assign(
+            status=data.status.where(own, 0).assign_attrs(data.status.attrs)
+        )
     for part in parts(data):
         which = f", {part.attrs['grains']} grains" if "grains" in data.dims else ""
         which += f", time step {part.attrs['timestep']:g}" if "timestep" in data.dims else ""
@@ -31,7 +41,9 @@ def bad_points(data: MapData) -> dict[str, list[str]]:
             for alpha in part.restitution.values:
                 name = names[int(part.status.sel(packing_fraction=nu, restitution=alpha))]
                 if name != "ok":
-                    bad.setdefault(name, []).append(f"(restitution {alpha:g}, packing fraction {nu:g}{which})")
+                    bad.setdefault(name, []).append(
+                        f"(restitution {alpha:g}, packing fraction {nu:g}{which})"
+                    )
     return bad
 
 
@@ -51,7 +63,8 @@ def format_short(data: MapData, points: list[str]) -> str:
     enough = FEWEST_CORRELATION_STRAINS * float(data.correlation_strain.where(short).max())
     which = "" if data.status.size == 1 else f" at {_some(points)}"
     return (
-        f"short sample{which}: less than {FEWEST_CORRELATION_STRAINS:g} correlation strains, so its errors may be too "
+        f"short sample{which}: less than {FEWEST_CORRELATION_STRAINS:g} correlation strains, so "
+        "its errors may be too "
         f"small; set `strain={math.ceil(enough)}`."
     )
 

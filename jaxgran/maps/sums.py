@@ -1,4 +1,6 @@
-"""The running sums of the replicas in the data of a map, so that maps are merged with the averages of one run."""
+"""The running sums of the replicas in the data of a map, so that maps are merged with the averages
+of one run.
+"""
 
 from collections.abc import Mapping
 
@@ -23,13 +25,15 @@ def sum_variables(
 ) -> dict[str, xr.Variable]:
     """The group ``sums``.
 
-    ========  ==============================  =======================================================================
+    ========  ==============================  ======================================================
     variable  dimensions                      meaning
-    ========  ==============================  =======================================================================
-    tally     (point, seed, block, quantity)  the numbers of the ``Tally`` of each block of a sample, in the order of
-                                              its fields, and behind them the sums of the user's observables
+    ========  ==============================  ======================================================
+    tally     (point, seed, block, quantity)  the numbers of the ``Tally`` of each block of a
+                                              sample, in the order of
+                                              its fields, and behind them the sums of the user's
+                                              observables
     area      (point, seed)                   area of the cell
-    ========  ==============================  =======================================================================
+    ========  ==============================  ======================================================
     """
     flat = {}
     for key, replica in replicas.items():
@@ -39,7 +43,10 @@ def sum_variables(
     sums, area = np.full((*shape, *next(iter(flat.values())).shape), np.nan), np.full(shape, np.nan)
     for key, numbers in flat.items():
         sums[key], area[key] = numbers, replicas[key].sample.area  # type: ignore[union-attr]
-    about = {"long_name": "running sums of each block of a sample, in the order of the fields of Tally", "units": "1"}
+    about = {
+        "long_name": "running sums of each block of a sample, in the order of the fields of Tally",
+        "units": "1",
+    }
     about_area = {"long_name": "area of the cell", "units": "sigma^2"}
     tally = grid.variable(sums, about, "seed", "block", "quantity")
     tally.encoding = {"zlib": True, "shuffle": True, "complevel": 4}
@@ -47,7 +54,8 @@ def sum_variables(
 
 
 def replicas_of(data: xr.DataTree, settings: MapSettings) -> dict[Key, Replica | None]:
-    """The replicas of a map of these settings, by point and seed from 0; None for those that were given up.
+    """The replicas of a map of these settings, by point and seed from 0; None for those that were
+    given up.
 
     Raises:
       InputError: (a ValueError) the data have no sums.
@@ -57,9 +65,12 @@ def replicas_of(data: xr.DataTree, settings: MapSettings) -> dict[Key, Replica |
     flows = settings.flows()
     shape, numbers = (len(flows), settings.seeds), flattened(data)
     status, strain, area = (
-        numbers[name].values.reshape(shape) for name in ("seeds/status", "seeds/equilibration_strain", "sums/area")
+        numbers[name].values.reshape(shape)
+        for name in ("seeds/status", "seeds/equilibration_strain", "sums/area")
     )
-    flags = numbers["seeds/status"].attrs  # those of the file, which an earlier version may have written
+    flags = numbers[
+        "seeds/status"
+    ].attrs  # those of the file, which an earlier version may have written
     for value, name in zip(flags["flag_values"], flags["flag_meanings"].split(), strict=True):
         own = Status[name] if name in Status.__members__ else NOT_RUN
         status = np.where(numbers["seeds/status"].values.reshape(shape) == value, own, status)

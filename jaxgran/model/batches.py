@@ -1,4 +1,6 @@
-"""Values, which are pytrees of arrays: their equality, and batches, whose arrays have leading axes of replicas."""
+"""Values, which are pytrees of arrays: their equality, and batches, whose arrays have leading axes
+of replicas.
+"""
 
 from typing import Any, Self, TypeVar
 
@@ -11,7 +13,9 @@ T = TypeVar("T")
 
 
 class Indexable:
-    """Base of values that may be batches, or series: they are indexed, sliced and counted along their first axis."""
+    """Base of values that may be batches, or series: they are indexed, sliced and counted along
+    their first axis.
+    """
 
     _whole = "a batch"
 
@@ -29,15 +33,21 @@ class Indexable:
         """
         if not self._axes:
             name = type(self).__name__
-            raise InputError(f"an index takes one of {self._whole}, and this is one {name}, not {self._whole}.")
+            raise InputError(
+                f"an index takes one of {self._whole}, and this is one {name}, not {self._whole}."
+            )
         if not is_traced(place):
-            np.broadcast_to(0, self._axes)[place]  # JAX would take the last in place of one that is not there
+            np.broadcast_to(0, self._axes)[
+                place
+            ]  # JAX would take the last in place of one that is not there
         return jax.tree.map(lambda leaf: leaf[place], self)
 
     def __len__(self) -> int:
         """How many a batch or series holds; TypeError for a single value."""
         if not self._axes:
-            raise TypeError(f"this is one {type(self).__name__}, not {self._whole}, and has no length.")
+            raise TypeError(
+                f"this is one {type(self).__name__}, not {self._whole}, and has no length."
+            )
         return self._axes[0]
 
     def __bool__(self) -> bool:
@@ -45,10 +55,12 @@ class Indexable:
 
 
 def equal_values(one: Any, other: object) -> bool:
-    """Whether two values are of one class and hold equal numbers of equal shapes: the method ``__eq__``.
+    """Whether two values are of one class and hold equal numbers of equal shapes: the method
+    ``__eq__``.
 
-    Libraries, precisions and NaN do not matter: an array of NumPy equals one of JAX, and NaN equals NaN in its place.
-    Parameters that are not traced, such as the number of grains, must be equal, too.
+    Libraries, precisions and NaN do not matter: an array of NumPy equals one of JAX, and NaN equals
+      NaN in its place. Parameters that are not traced, such as the number of grains, must be equal,
+      too.
 
     Raises:
       InputError: JAX traces one of the values.
@@ -57,10 +69,13 @@ def equal_values(one: Any, other: object) -> bool:
         return NotImplemented
     if is_traced(one, other):
         raise InputError(
-            f"two values of {type(one).__name__} cannot be compared while JAX traces them: compare them before or "
+            f"two values of {type(one).__name__} cannot be compared while JAX traces them: compare "
+            "them before or "
             "after, or their arrays by jnp.array_equal."
         )
-    one, other = (vars(x) if jax.tree_util.all_leaves([x]) else x for x in (one, other))  # what is no pytree
+    one, other = (
+        vars(x) if jax.tree_util.all_leaves([x]) else x for x in (one, other)
+    )  # what is no pytree
     (leaves, structure), (others, of_other) = jax.tree.flatten(one), jax.tree.flatten(other)
     return structure == of_other and all(map(_equal, leaves, others))
 
@@ -71,7 +86,8 @@ def _equal(one: Any, other: Any) -> bool:
 
 
 def hash_of_values(self: Any) -> int:
-    """The method ``__hash__`` that agrees with ``equal_values``, for values that may hold single numbers of Python.
+    """The method ``__hash__`` that agrees with ``equal_values``, for values that may hold single
+    numbers of Python.
 
     Raises:
       TypeError: it holds an array.
@@ -81,5 +97,7 @@ def hash_of_values(self: Any) -> int:
 
 
 def in_numpy(tree: T) -> T:
-    """The same with NumPy arrays, whose small sums need no compilation; unchanged where JAX traces part of it."""
+    """The same with NumPy arrays, whose small sums need no compilation; unchanged where JAX traces
+    part of it.
+    """
     return tree if is_traced(tree) else jax.tree.map(np.asarray, tree)

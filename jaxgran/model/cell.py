@@ -1,8 +1,8 @@
 """The sheared periodic cell (Lees–Edwards): a square of side L whose image rows slide along x.
 
-The lattice vectors are (L, 0) and (tilt·L, L). Adding an integer to the tilt gives the same lattice, so the tilt is
-kept in [−½, ½). Velocities are peculiar (SLLOD): all images of a grain have the same one. The velocity jump between
-images enters through γ̇ Δy of the separation.
+The lattice vectors are (L, 0) and (tilt·L, L). Adding an integer to the tilt gives the same
+lattice, so the tilt is kept in [−½, ½). Velocities are peculiar (SLLOD): all images of a grain have
+the same one. The velocity jump between images enters through γ̇ Δy of the separation.
 """
 
 import jax.numpy as jnp
@@ -16,7 +16,8 @@ def cell_side(radii: Float[Array, " grains"], packing_fraction: float | Array) -
     """Side L of the square cell in which the discs have the given packing fraction.
 
     Examples:
-      >>> float(cell_side(jnp.full(4, 0.5), jnp.pi / 4))  # four discs of diameter 1, each fills π/4 of a unit square
+      >>> # four discs of diameter 1, each fills π/4 of a unit square
+      >>> float(cell_side(jnp.full(4, 0.5), jnp.pi / 4))
       2.0
     """
     return jnp.sqrt(jnp.pi * jnp.sum(radii**2) / packing_fraction)
@@ -54,7 +55,9 @@ def wrap(positions: Float[Array, "grains 2"], side: Array, tilt: Array) -> Float
     """The images of the positions that have x and y in [0, L)."""
     x, y = positions[:, 0], positions[:, 1]
     rows = jnp.floor(y / side)
-    rows = jnp.where(y - rows * side >= side, rows + 1, rows)  # L plus a tiny negative y rounds to L
+    rows = jnp.where(
+        y - rows * side >= side, rows + 1, rows
+    )  # L plus a tiny negative y rounds to L
     x = x - rows * tilt * side
     x = x - side * jnp.floor(x / side)
     return jnp.stack([jnp.where(x >= side, 0, x), jnp.maximum(y - rows * side, 0)], axis=-1)
@@ -72,19 +75,27 @@ def relative_velocity(
     separations: Float[Array, "pairs 2"],
     shear_rate: float | Array,
 ) -> Float[Array, "pairs 2"]:
-    """Velocity of grain i relative to the nearest image of grain j, in the laboratory frame: c_i − c_j + γ̇ Δy x̂."""
+    """Velocity of grain i relative to the nearest image of grain j, in the laboratory frame: c_i −
+    c_j + γ̇ Δy x̂.
+    """
     peculiar = taken(velocities, i) - taken(velocities, j)
     return jnp.stack([peculiar[:, 0] + shear_rate * separations[:, 1], peculiar[:, 1]], axis=-1)
 
 
-def minimum_image(separations: Float[np.ndarray, "n 2"], side: float, tilt: float) -> Float[np.ndarray, "n 2"]:
-    """The minimum image of separations in NumPy, exact if they are shorter than half the side; see ``displacement``."""
+def minimum_image(
+    separations: Float[np.ndarray, "n 2"], side: float, tilt: float
+) -> Float[np.ndarray, "n 2"]:
+    """The minimum image of separations in NumPy, exact if they are shorter than half the side; see
+    ``displacement``.
+    """
     rows = np.round(separations[:, 1] / side)
     x = separations[:, 0] - rows * tilt * side
     return np.stack([x - side * np.round(x / side), separations[:, 1] - rows * side], axis=-1)
 
 
-def centred(positions: Float[np.ndarray, "grains 2"], side: float, tilt: float) -> Float[np.ndarray, "grains 2"]:
+def centred(
+    positions: Float[np.ndarray, "grains 2"], side: float, tilt: float
+) -> Float[np.ndarray, "grains 2"]:
     """The images of positions in [0, L) that lie in the sheared cell whose centre is the origin."""
     x, y = (positions - side / 2).T
     return np.stack([x - side * np.floor((x - tilt * y) / side + 0.5), y], axis=-1)

@@ -10,8 +10,9 @@ import numpy as np
 class InputError(ValueError):
     """Input that is not accepted; the message is one sentence that says what is.
 
-    Parameter names in the message stand in backticks, unless the message begins with the name of ``field``. So a caller
-    with other names for the parameters, such as the command line, can replace them.
+    Parameter names in the message stand in backticks, unless the message begins with the name of
+    ``field``. So a caller with other names for the parameters, such as the command line, can
+    replace them.
 
     Attributes:
       field: the parameter at fault, or "".
@@ -33,7 +34,9 @@ def _input_error(message: str, field: str, reason: str) -> InputError:
 
 def refused(field: str, value: Any, reason: str) -> InputError:
     """The error of a parameter whose value is not accepted: "FIELD REASON, not VALUE."."""
-    return InputError(f"{field} {reason}, not {short_repr(value)}.", field=field, value=value, reason=reason)
+    return InputError(
+        f"{field} {reason}, not {short_repr(value)}.", field=field, value=value, reason=reason
+    )
 
 
 def concrete_or_none(value: Any) -> np.ndarray | None:
@@ -55,7 +58,9 @@ def concrete_or_none(value: Any) -> np.ndarray | None:
 
 
 def two_digits(value: float, up: bool) -> str:
-    """A positive limit as 1.2e-03, rounded up or down so that the printed number is itself accepted."""
+    """A positive limit as 1.2e-03, rounded up or down so that the printed number is itself
+    accepted.
+    """
     unit = 10.0 ** (np.floor(np.log10(value)) - 1)
     return f"{(np.ceil if up else np.floor)(value / unit) * unit:.1e}"
 
@@ -91,7 +96,8 @@ def require(name: str, value: Any, accepts: Callable, accepted: str) -> None:
 
 
 def as_array(values: Any) -> Any:
-    """A list or tuple of numbers, or of equally long ones, as an array of floats; any other value unchanged.
+    """A list or tuple of numbers, or of equally long ones, as an array of floats; any other value
+    unchanged.
 
     Examples:
       >>> as_array([[1, 0], (0, 1)]).tolist(), as_array(["a"])
@@ -104,7 +110,9 @@ def as_array(values: Any) -> Any:
         alike = all(isinstance(x, np.ndarray) and x.shape == np.shape(rows[0]) for x in rows)
         return np.stack(rows) if alike else values
     numbers = all(
-        isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) and abs(x) < 1e300
+        isinstance(x, (int, float, np.integer, np.floating))
+        and not isinstance(x, bool)
+        and abs(x) < 1e300
         for x in values
     )
     return np.asarray(values, float) if numbers else values
@@ -116,7 +124,9 @@ def require_number(name: str, value: Any, accepts: Callable, accepted: str) -> N
 
 
 def require_whole(name: str, value: Any, least: int, most: int, because: str = "") -> None:
-    """Raise an InputError unless the value is a whole number in [least, most]; ``because`` explains the upper limit."""
+    """Raise an InputError unless the value is a whole number in [least, most]; ``because`` explains
+    the upper limit.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise refused(name, value, f"must be a whole number of at least {least}")
     if value > most:
@@ -138,15 +148,21 @@ def is_traced(*values: Any) -> bool:
 
 
 def require_untraced(name: str, instead: str, *values: Any) -> None:
-    """Raise an InputError if JAX traces a value that is needed in Python; ``instead`` says what to do."""
+    """Raise an InputError if JAX traces a value that is needed in Python; ``instead`` says what to
+    do.
+    """
     if is_traced(*values):
-        raise InputError(f"{name} cannot be transformed by jax.jit, jax.vmap or jax.grad: {instead}.")
+        raise InputError(
+            f"{name} cannot be transformed by jax.jit, jax.vmap or jax.grad: {instead}."
+        )
 
 
 def require_key(key: Any) -> None:
     """Raise an InputError unless this is a single JAX random key."""
     if key_shape(key) != ():
-        raise InputError(f"key must be a random key such as jax.random.key(0), not {short_repr(key)}.")
+        raise InputError(
+            f"key must be a random key such as jax.random.key(0), not {short_repr(key)}."
+        )
 
 
 def key_shape(key: Any) -> tuple[int, ...] | None:
@@ -155,5 +171,9 @@ def key_shape(key: Any) -> tuple[int, ...] | None:
 
     if isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key):
         return key.shape
-    raw = isinstance(key, (jax.Array, np.ndarray)) and key.dtype == np.uint32 and key.shape[-1:] == (2,)
+    raw = (
+        isinstance(key, (jax.Array, np.ndarray))
+        and key.dtype == np.uint32
+        and key.shape[-1:] == (2,)
+    )
     return key.shape[:-1] if raw else None

@@ -1,4 +1,6 @@
-"""Choices of a user, limits of numbers, and the width of intervals: constants that need no other module."""
+"""Choices of a user, limits of numbers, and the width of intervals: constants that need no other
+module.
+"""
 
 from typing import Literal
 

@@ -1,8 +1,9 @@
 """Real control flow for a batch of replicas.
 
-Under ``vmap`` a batched predicate turns ``lax.cond`` into a ``select``, which computes both branches. Reduced over the
-named axis ``AXIS``, the predicate is one scalar for the whole batch, and only one branch is computed. Outside a
-batch, and under ``lax.map``, there is no such axis: the functions below then return their argument unchanged.
+Under ``vmap`` a batched predicate turns ``lax.cond`` into a ``select``, which computes both
+branches. Reduced over the named axis ``AXIS``, the predicate is one scalar for the whole batch, and
+only one branch is computed. Outside a batch, and under ``lax.map``, there is no such axis: the
+functions below then return their argument unchanged.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +28,9 @@ def in_batch() -> bool:
 
 
 def any_replica(predicate: jax.Array) -> jax.Array:
-    """Whether the predicate holds in at least one replica of the batch; the predicate itself outside a batch."""
+    """Whether the predicate holds in at least one replica of the batch; the predicate itself
+    outside a batch.
+    """
     return lax.pmax(predicate.astype(jnp.int32), AXIS) > 0 if in_batch() else predicate
 
 
@@ -41,11 +44,13 @@ def where_active(active: jax.Array, new: T, old: T) -> T:
     return jax.tree.map(lambda a, b: jnp.where(active, a, b), new, old)
 
 
-def switch_replica(branch: jax.Array, default: T, branches: Sequence[Callable[[jax.Array], T]]) -> T:
+def switch_replica(
+    branch: jax.Array, default: T, branches: Sequence[Callable[[jax.Array], T]]
+) -> T:
     """The result of the branch of the given number, counted from one, or ``default`` for 0.
 
-    A branch is given whether this replica takes it. A batch computes each branch that one of its replicas takes, and no
-    other, so that the result of a replica does not depend on the batch.
+    A branch is given whether this replica takes it. A batch computes each branch that one of its
+    replicas takes, and no other, so that the result of a replica does not depend on the batch.
     """
     if not in_batch():
         taken = jnp.bool_(True)
@@ -53,5 +58,10 @@ def switch_replica(branch: jax.Array, default: T, branches: Sequence[Callable[[j
     result = default
     for number, take in enumerate(branches, 1):
         mine = branch == number
-        result = lax.cond(any_replica(mine), lambda: where_active(mine, take(mine), result), lambda: result)  # noqa: B023
+        compute = partial(_taken, take, mine, result)
+        result = lax.cond(any_replica(mine), compute, partial(lambda same: same, result))
     return result
+
+
+def _taken(take: Callable[[jax.Array], T], mine: jax.Array, result: T) -> T:
+    return where_active(mine, take(mine), result)

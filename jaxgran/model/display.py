@@ -1,7 +1,7 @@
 """Text of an object: one line for ``repr``.
 
-An array of many values is shown by its shape and its range, so a batch of a thousand replicas needs no more space than
-one. A traced value is shown by its type.
+An array of many values is shown by its shape and its range, so a batch of a thousand replicas needs
+no more space than one. A traced value is shown by its type.
 """
 
 import math
@@ -35,8 +35,8 @@ def text_of(title: str, rows: Sequence[Row]) -> str:
 def value_text(value: Any, error: Any = None) -> str:
     """A value as short text.
 
-    A single number is shown with its error, if known. Many numbers are shown by shape and range. Any other value is
-    shown by its ``repr``.
+    A single number is shown with its error, if known. Many numbers are shown by shape and range.
+    Any other value is shown by its ``repr``.
     """
     numbers = _numbers(value)
     if numbers is None:
@@ -57,7 +57,8 @@ def value_text(value: Any, error: Any = None) -> str:
 def with_error(value: float, error: float) -> str:
     """A value and its standard error as text, both to the digits that the error leaves.
 
-    The error has two digits up to 3.5 in its first digit, and one above, as the Particle Data Group rounds.
+    The error has two digits up to 3.5 in its first digit, and one above, as the Particle Data Group
+    rounds.
 
     Examples:
       >>> with_error(58.724, 6.04), with_error(1.000123, 0.00019), with_error(-7.98e-7, 1e-6)
@@ -77,8 +78,17 @@ def with_error(value: float, error: float) -> str:
 
 
 def unit_text(unit: str) -> str:
-    """A unit of the tables with its signs, such as ``mσ²/t²`` for ``m sigma^2 / t^2``; nothing for a pure number."""
-    for word, sign in (("shear rate", "γ̇"), ("m sigma", "mσ"), ("sigma", "σ"), ("^2", "²"), ("^3", "³"), (" / ", "/")):
+    """A unit of the tables with its signs, such as ``mσ²/t²`` for ``m sigma^2 / t^2``; nothing for
+    a pure number.
+    """
+    for word, sign in (
+        ("shear rate", "γ̇"),
+        ("m sigma", "mσ"),
+        ("sigma", "σ"),
+        ("^2", "²"),
+        ("^3", "³"),
+        (" / ", "/"),
+    ):
         unit = unit.replace(word, sign)
     return "" if unit == "1" else unit
 
@@ -97,7 +107,9 @@ def _numbers(value: Any) -> np.ndarray | None:
 def statuses(codes: np.ndarray) -> str:
     """The name of one status, or the names of many with their counts."""
     names = Counter(Status(int(code)).name for code in np.ravel(codes))
-    return ", ".join(name if np.ndim(codes) == 0 else f"{name} ({count})" for name, count in names.most_common())
+    return ", ".join(
+        name if np.ndim(codes) == 0 else f"{name} ({count})" for name, count in names.most_common()
+    )
 
 
 def rounded(value: Any) -> Any:

@@ -20,7 +20,13 @@ from jaxgran.model.checks import (
     require_whole,
     short_repr,
 )
-from jaxgran.model.choices import MAX_GRAINS, MAX_PACKING_FRACTION, MAX_STEPS, MIN_GRAINS, Activation
+from jaxgran.model.choices import (
+    MAX_GRAINS,
+    MAX_PACKING_FRACTION,
+    MAX_STEPS,
+    MIN_GRAINS,
+    Activation,
+)
 from jaxgran.model.display import Row, text_of
 
 _LOOK_AHEAD = {"midpoint": 0.5, "touching": 0.0}  # θ of the activation rules
@@ -34,29 +40,34 @@ def _rows(flow: "ShearFlow") -> list[Row]:
 class ShearFlow(Indexable):
     """Parameters of a simple shear flow of rigid, frictionless, polydisperse discs.
 
-    The unit of length is the mean grain diameter σ. The unit of mass is the mass m of a grain of diameter σ.
-    ``grains`` is static. All other fields are traced: changing them recompiles nothing. A batch of flows is one
-    ``ShearFlow`` whose numbers are lists or arrays with a leading ``(replicas,)`` axis; numbers that are the same for
-    all are broadcast, and ``flows[0]`` is the first of them. JAX traces the number θ of ``activation``, so a batch, and
-    the flow that a transformed function receives, have θ in that field. How a flow is solved is no part of it: see the
-    arguments ``solver`` and ``engine`` of ``sample``.
+    The unit of length is the mean grain diameter σ. The unit of mass is the mass m of a grain of
+    diameter σ. ``grains`` is static. All other fields are traced: changing them recompiles nothing.
+    A batch of flows is one ``ShearFlow`` whose numbers are lists or arrays with a leading
+    ``(replicas,)`` axis; numbers that are the same for all are broadcast, and ``flows[0]`` is the
+    first of them. JAX traces the number θ of ``activation``, so a batch, and the flow that a
+    transformed function receives, have θ in that field. How a flow is solved is no part of it: see
+    the arguments ``solver`` and ``engine`` of ``sample``.
 
-    ================  =================  ===============================================================
+    ================  =================  ===========================================================
     field             unit               meaning
-    ================  =================  ===============================================================
+    ================  =================  ===========================================================
     grains            –                  number of discs N, 16 to 1e7
-    restitution       –                  α in [0, 1], normal velocity after a collision over that before
+    restitution       –                  α in [0, 1], normal velocity after a collision over that
+                                         before
     packing_fraction  –                  ν in (0, 0.83], area of the grains over area of the cell
     timestep          1/shear_rate = 1   dt, at most 0.1
     shear_rate        1/time             γ̇ ≥ 0; 0 in free cooling, where the unit of time is free
-    polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ; not used with ``own_grains``
-    activation        –                  "midpoint": contact if the grains overlap after half a step of free flight;
-                                         "touching": contact if the grains overlap now; or θ, 0.5 or 0
-    ================  =================  ===============================================================
+    polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ; not used with
+                                         ``own_grains``
+    activation        –                  "midpoint": contact if the grains overlap after half a step
+                                         of free flight;
+                                         "touching": contact if the grains overlap now; or θ, 0.5 or
+                                         0
+    ================  =================  ===========================================================
 
     Raises:
-      InputError: (a ValueError) a number is outside its range, or arrays differ in shape; the values of traced numbers
-        are not checked.
+      InputError: (a ValueError) a number is outside its range, or arrays differ in shape; the
+        values of traced numbers are not checked.
 
     Examples:
       >>> flows = ShearFlow(grains=64, restitution=[0.5, 0.9], packing_fraction=0.6, timestep=1e-3)
@@ -80,18 +91,32 @@ class ShearFlow(Indexable):
     def __post_init__(self):
         require_whole("grains", self.grains, MIN_GRAINS, MAX_GRAINS, "as memory is limited")
         if not isinstance(self.activation, str) or self.activation not in _LOOK_AHEAD:
-            require("activation", self.activation, lambda x: (x == 0.5) | (x == 0), " or ".join(_LOOK_AHEAD))
+            require(
+                "activation",
+                self.activation,
+                lambda x: (x == 0.5) | (x == 0),
+                " or ".join(_LOOK_AHEAD),
+            )
         for name, (accepts, words) in RANGES.items():
             object.__setattr__(self, name, as_array(getattr(self, name)))
             require(name, getattr(self, name), accepts, words)
         shapes = sorted({np.shape(getattr(self, name)) for name in _TRACED_FIELDS} - {()})
         if len(shapes) > 1:
-            raise InputError(f"the numbers of a batch of flows must be arrays of one shape, not {short_repr(shapes)}.")
+            raise InputError(
+                "the numbers of a batch of flows must be arrays of one shape, not "
+                f"{short_repr(shapes)}."
+            )
         timestep, shear_rate = concrete_or_none(self.timestep), concrete_or_none(self.shear_rate)
         with np.errstate(over="ignore"):
-            too_long = timestep is not None and shear_rate is not None and np.any(timestep * shear_rate > 0.1)
+            too_long = (
+                timestep is not None
+                and shear_rate is not None
+                and np.any(timestep * shear_rate > 0.1)
+            )
         if too_long:
-            raise InputError(f"timestep must be at most 0.1 / shear_rate, not {short_repr(self.timestep)}.")
+            raise InputError(
+                f"timestep must be at most 0.1 / shear_rate, not {short_repr(self.timestep)}."
+            )
         if shapes:
             _broadcast(self, shapes[0])
 
@@ -101,7 +126,9 @@ class ShearFlow(Indexable):
 
     @property
     def activation_fraction(self) -> float | jax.Array:
-        """θ: fraction of a time step of free flight after which an overlapping pair is a contact."""
+        """θ: fraction of a time step of free flight after which an overlapping pair is a
+        contact.
+        """
         return _LOOK_AHEAD[self.activation] if isinstance(self.activation, str) else self.activation
 
 
@@ -114,19 +141,27 @@ def _traced(flow: ShearFlow, name: str) -> Any:
 
 
 def _broadcast(flow: ShearFlow, shape: tuple[int, ...]) -> None:
-    """Give every number of a batch its axis of replicas, in the precision of those that have it already."""
+    """Give every number of a batch its axis of replicas, in the precision of those that have it
+    already.
+    """
     numbers = {name: _traced(flow, name) for name in _TRACED_FIELDS}
     kind = jnp.result_type(*(value for value in numbers.values() if np.ndim(value)))
     kind = kind if jnp.issubdtype(kind, jnp.floating) else jnp.result_type(float)
     for name, value in numbers.items():
         if np.ndim(value) == 0:
             traced = isinstance(value, Tracer)
-            repeated = jnp.broadcast_to(value, shape) if traced else np.broadcast_to(np.asarray(value, kind), shape)
+            repeated = (
+                jnp.broadcast_to(value, shape)
+                if traced
+                else np.broadcast_to(np.asarray(value, kind), shape)
+            )
             object.__setattr__(flow, name, repeated)
 
 
 def _unflatten(static: tuple, traced: Iterable) -> ShearFlow:
-    """A flow of any leaves, without checks: JAX also passes derivatives, axis numbers and placeholders."""
+    """A flow of any leaves, without checks: JAX also passes derivatives, axis numbers and
+    placeholders.
+    """
     flow = object.__new__(ShearFlow)
     for name, value in zip(_STATIC_FIELDS + _TRACED_FIELDS, (*static, *traced), strict=True):
         object.__setattr__(flow, name, value)
@@ -155,20 +190,25 @@ RANGES = {
 
 
 def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:
-    """Raise an InputError unless the strain has at least one time step a part and at most ``MAX_STEPS`` in all."""
+    """Raise an InputError unless the strain has at least one time step a part and at most
+    ``MAX_STEPS`` in all.
+    """
     require_sheared(flow)
     require_number("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
     if not is_traced(strain, flow.shear_rate, flow.timestep):
         step = float(np.asarray(flow.shear_rate) * np.asarray(flow.timestep))
         least, most = parts * step, MAX_STEPS * step
-        require("strain", strain, lambda x: x >= 0.99 * least, f"at least {parts} time steps, {least:g}")
+        require(
+            "strain", strain, lambda x: x >= 0.99 * least, f"at least {parts} time steps, {least:g}"
+        )
         require("strain", strain, lambda x: x <= most, f"at most {MAX_STEPS} time steps, {most:g}")
 
 
 def steps_of_strain(flow: ShearFlow, strain: Any) -> Any:
     """Whole numbers of time steps nearest to a strain, as floats, for one flow or each of a batch.
 
-    It is computed with JAX where values are traced and with NumPy otherwise, in the same precision to the same bits.
+    It is computed with JAX where values are traced and with NumPy otherwise, in the same precision
+    to the same bits.
 
     Examples:
       >>> flow = ShearFlow(grains=64, restitution=0.5, packing_fraction=0.6, timestep=1e-3)
@@ -182,7 +222,8 @@ def steps_of_strain(flow: ShearFlow, strain: Any) -> Any:
 
 
 def steps_of_blocks(steps: Any, blocks: int) -> Any:
-    """Time steps of each of ``blocks`` parts of ``steps`` time steps, (..., blocks), which differ by one at most.
+    """Time steps of each of ``blocks`` parts of ``steps`` time steps, (..., blocks), which differ
+    by one at most.
 
     Examples:
       >>> steps_of_blocks(np.array(10.0), 4).tolist()
@@ -199,12 +240,15 @@ def require_sheared(flow: ShearFlow) -> None:
 
 
 def one_of(flow: Any, k: int, count: int) -> ShearFlow:
-    """Flow ``k`` of a batch of ``count``, whose numbers are single ones, the same for all, or arrays of ``count``."""
+    """Flow ``k`` of a batch of ``count``, whose numbers are single ones, the same for all, or
+    arrays of ``count``.
+    """
     _require_flows(flow)
     shapes = {np.shape(getattr(flow, name)) for name in _TRACED_FIELDS} - {()}
     if shapes - {(count,)}:
         raise InputError(
-            f"numbers of the flow must be single ones or arrays ({count},), one for each key, not of the shapes "
+            f"numbers of the flow must be single ones or arrays ({count},), one for each key, not "
+            "of the shapes "
             f"{', '.join(map(str, sorted(shapes)))}."
         )
     return jax.tree.map(lambda x: np.broadcast_to(x, (count,))[k], flow)
@@ -217,11 +261,15 @@ def _require_flows(flow: Any) -> None:
 
 def is_batch(flow: Any) -> bool:
     """Whether this is a ShearFlow whose numbers have an axis of replicas."""
-    return isinstance(flow, ShearFlow) and any(np.ndim(getattr(flow, name)) for name in _TRACED_FIELDS)
+    return isinstance(flow, ShearFlow) and any(
+        np.ndim(getattr(flow, name)) for name in _TRACED_FIELDS
+    )
 
 
 def require_flow(flow: Any) -> None:
     """Raise an InputError unless this is a single ShearFlow, not a batch."""
     _require_flows(flow)
     if is_batch(flow):
-        raise InputError("flow must be one ShearFlow, and this is a batch: use jax.vmap or jax.lax.map.")
+        raise InputError(
+            "flow must be one ShearFlow, and this is a batch: use jax.vmap or jax.lax.map."
+        )

@@ -11,12 +11,22 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgran.model.batches import equal_values
-from jaxgran.model.checks import InputError, as_array, require, require_key, require_number, require_whole, short_repr
+from jaxgran.model.checks import (
+    InputError,
+    as_array,
+    require,
+    require_key,
+    require_number,
+    require_whole,
+    short_repr,
+)
 from jaxgran.model.choices import MAX_GRAINS
 
 _POSITIVE = "a list of positive numbers"
 _LARGEST_VALUE = 1e30  # of a diameter or a mass; their sums stay finite in float32
-_MEAN_DIAMETER_TOLERANCE = 1e-3  # σ; allowed difference between the mean of given diameters and the unit of length
+_MEAN_DIAMETER_TOLERANCE = (
+    1e-3  # σ; allowed difference between the mean of given diameters and the unit of length
+)
 
 
 @jax.tree_util.register_dataclass
@@ -39,10 +49,12 @@ class Grains:
 
 
 def polydisperse(count: int, polydispersity: float | Array, key: Array) -> Grains:
-    """Discs with diameters uniform in 1 ± ``polydispersity`` and masses equal to the diameter squared.
+    """Discs with diameters uniform in 1 ± ``polydispersity`` and masses equal to the diameter
+    squared.
 
-    The diameters are the quantile midpoints of the uniform distribution, in random order. Their mean is exactly one,
-    and every replica has the same sizes. Independent draws of 1000 diameters would change the pressure by 1–2 %.
+    The diameters are the quantile midpoints of the uniform distribution, in random order. Their
+    mean is exactly one, and every replica has the same sizes. Independent draws of 1000 diameters
+    would change the pressure by 1–2 %.
 
     Args:
       count: number of grains.
@@ -50,7 +62,9 @@ def polydisperse(count: int, polydispersity: float | Array, key: Array) -> Grain
       key: JAX random key.
     """
     require_whole("count", count, 1, MAX_GRAINS, "as memory is limited")
-    require_number("polydispersity", polydispersity, lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5")
+    require_number(
+        "polydispersity", polydispersity, lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"
+    )
     require_key(key)
     quantile = (jnp.arange(count, dtype=jnp.result_type(float)) + 0.5) / count
     diameters = jax.random.permutation(key, 1 + polydispersity * (2 * quantile - 1))
@@ -60,36 +74,46 @@ def polydisperse(count: int, polydispersity: float | Array, key: Array) -> Grain
 def own_grains(diameters: ArrayLike, masses: ArrayLike | None = None) -> Grains:
     """Discs of any diameters and masses, for ``prepare``, ``heated`` and ``pack``.
 
-    Lengths are in mean diameters, so the diameters are divided by their mean. Masses are not rescaled. They are in the
-    unit m of all stresses and temperatures. The inertial number and Bagnold's coefficients take m as the mass of a mean
-    grain. In this bidisperse packing every second grain is hollow, and the solid grains of both sizes have mass m:
+    Lengths are in mean diameters, so the diameters are divided by their mean. Masses are not
+    rescaled. They are in the unit m of all stresses and temperatures. The inertial number and
+    Bagnold's coefficients take m as the mass of a mean grain. In this bidisperse packing every
+    second grain is hollow, and the solid grains of both sizes have mass m:
 
         diameters = np.repeat([1.0, 1.4], 128)
         grains = jg.own_grains(diameters, masses=np.where(np.arange(256) % 2, 0.1, 1.0))
 
-    =========  =========  ====  ===============================================================================
+    =========  =========  ====  ====================================================================
     argument   shape      unit  meaning
-    =========  =========  ====  ===============================================================================
+    =========  =========  ====  ====================================================================
     diameters  (grains,)  any   diameters, in any order: their positions in the packing are random
-    masses     (grains,)  m     masses; None for equal density: the squares of the diameters over their mean
-    =========  =========  ====  ===============================================================================
+    masses     (grains,)  m     masses; None for equal density: the squares of the diameters over
+                                their mean
+    =========  =========  ====  ====================================================================
 
     Raises:
       InputError: these are not two lists of positive numbers of the same length.
     """
-    given = {"diameters": as_array(diameters), **({} if masses is None else {"masses": as_array(masses)})}
+    given = {
+        "diameters": as_array(diameters),
+        **({} if masses is None else {"masses": as_array(masses)}),
+    }
     for name, values in given.items():
         require(name, values, lambda x: (x.ndim == 1) & (x > 0) & (x < _LARGEST_VALUE), _POSITIVE)
     sizes = jnp.asarray(given["diameters"], float)
     sizes = sizes / jnp.mean(sizes)
     weights = sizes**2 if masses is None else jnp.asarray(given["masses"], float)
     if weights.shape != sizes.shape:
-        raise InputError(f"there must be as many masses as diameters, and there are {weights.size} and {sizes.size}.")
+        raise InputError(
+            f"there must be as many masses as diameters, and there are {weights.size} and "
+            f"{sizes.size}."
+        )
     return Grains(radii=sizes / 2, masses=weights)
 
 
 def require_grains(grains: Any, count: int) -> None:
-    """Raise an InputError unless these are ``count`` grains of mean diameter 1; traced values are not checked."""
+    """Raise an InputError unless these are ``count`` grains of mean diameter 1; traced values are
+    not checked.
+    """
     words = f"grains must be Grains with radii and masses of {count} discs, as the flow has, not"
     if not isinstance(grains, Grains):
         raise InputError(f"{words} {short_repr(grains)}.")
@@ -102,5 +126,6 @@ def require_grains(grains: Any, count: int) -> None:
         mean = 2 * float(np.mean(np.asarray(grains.radii)))
         if abs(mean - 1) > _MEAN_DIAMETER_TOLERANCE:
             raise InputError(
-                f"the mean diameter must be 1, the unit of length, not {mean:g}: own_grains divides by it."
+                f"the mean diameter must be 1, the unit of length, not {mean:g}: own_grains "
+                "divides by it."
             )

@@ -1,4 +1,6 @@
-"""Gathers and scatters whose indices are known to be valid: without checks, a compiled program is a quarter shorter."""
+"""Gathers and scatters whose indices are known to be valid: without checks, a compiled program is a
+quarter shorter.
+"""
 
 from jaxtyping import Array, Int
 

@@ -1,4 +1,6 @@
-"""Reductions in the form that XLA compiles well on a processor; on other backends they are as good as any."""
+"""Reductions in the form that XLA compiles well on a processor; on other backends they are as good
+as any.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -29,9 +31,13 @@ def smallest(values: Float[Array, " n"]) -> Float[Array, ""]:
 
 @jax.custom_jvp
 def sums_of(vectors: tuple[Array, ...]) -> list[Array]:
-    """The sum of each vector, in one pass over all: one reduction each takes two to four times as long."""
+    """The sum of each vector, in one pass over all: one reduction each takes two to four times as
+    long.
+    """
     zeros = [jnp.zeros((), vectors[0].dtype)] * len(vectors)
-    return lax.reduce(list(vectors), zeros, lambda a, b: [x + y for x, y in zip(a, b, strict=True)], (0,))
+    return lax.reduce(
+        list(vectors), zeros, lambda a, b: [x + y for x, y in zip(a, b, strict=True)], (0,)
+    )
 
 
 @sums_of.defjvp

@@ -29,7 +29,10 @@ def _rows(state: "State") -> list[Row]:
     return [
         *[Row("replicas", count) for count in replicas],
         Row("grains", grains),
-        Row("packing_fraction", rounded(np.sum(np.pi * radii**2, axis=-1) / np.asarray(state.side) ** 2)),
+        Row(
+            "packing_fraction",
+            rounded(np.sum(np.pi * radii**2, axis=-1) / np.asarray(state.side) ** 2),
+        ),
         Row("granular_temperature", rounded(temperature)),
         Row("side", rounded(state.side)),
         Row("tilt", rounded(state.tilt)),
@@ -76,14 +79,20 @@ class State(Indexable):
 
 
 def require_state(flow: ShearFlow, state: State) -> None:
-    """Raise an InputError unless these are one flow and one state with its number of grains, in one precision."""
+    """Raise an InputError unless these are one flow and one state with its number of grains, in one
+    precision.
+    """
     require_flow(flow)
     if not isinstance(state, State) or jnp.shape(state.positions) != (flow.grains, 2):
+        given = type(state).__name__
+        if isinstance(state, State):
+            given = f"of positions {jnp.shape(state.positions)}"
         raise InputError(
-            f"state must be one State of {flow.grains} grains, best from prepare, not "
-            f"{f'of positions {jnp.shape(state.positions)}' if isinstance(state, State) else type(state).__name__}."
+            f"state must be one State of {flow.grains} grains, best from prepare, not {given}."
         )
-    precisions = sorted({leaf.dtype.name for leaf in jax.tree.leaves(state) if hasattr(leaf, "dtype")})
+    precisions = sorted(
+        {leaf.dtype.name for leaf in jax.tree.leaves(state) if hasattr(leaf, "dtype")}
+    )
     if len(precisions) > 1:
         raise InputError(
             f"state must be of one precision, and its numbers are {' and '.join(precisions)}: "
@@ -92,22 +101,29 @@ def require_state(flow: ShearFlow, state: State) -> None:
 
 
 def require_match(flow: ShearFlow, state: State) -> None:
-    """Raise an InputError if flow and state differ in packing fraction or polydispersity; traced values pass.
+    """Raise an InputError if flow and state differ in packing fraction or polydispersity; traced
+    values pass.
 
-    The engines take both from the state. Sizes other than those of ``polydisperse`` belong to no polydispersity.
+    The engines take both from the state. Sizes other than those of ``polydisperse`` belong to no
+    polydispersity.
     """
     if is_traced(flow, state):
         return
     radii = np.sort(np.asarray(state.grains.radii, float))
-    of_state = {"packing_fraction": float(np.pi * np.sum(radii**2) / np.asarray(state.side, float) ** 2)}
+    of_state = {
+        "packing_fraction": float(np.pi * np.sum(radii**2) / np.asarray(state.side, float) ** 2)
+    }
     quantiles = (2 * np.arange(radii.size) + 1) / radii.size - 1
     spread = (2 * radii[-1] - 1) / quantiles[-1]
-    if spread > _ROUNDING and np.allclose(2 * radii, 1 + spread * quantiles, rtol=0, atol=_ROUNDING):
+    if spread > _ROUNDING and np.allclose(
+        2 * radii, 1 + spread * quantiles, rtol=0, atol=_ROUNDING
+    ):
         of_state["polydispersity"] = float(spread)
     for name, found in of_state.items():
         if abs(found - float(getattr(flow, name))) > _ROUNDING:
             raise InputError(
-                f"{name} must be {found:.6g}, which the state has, not {float(getattr(flow, name)):g}: a flow with "
+                f"{name} must be {found:.6g}, which the state has, not "
+                f"{float(getattr(flow, name)):g}: a flow with "
                 "another one begins with a state of its own, from prepare."
             )
 
@@ -120,12 +136,16 @@ def kinetic_energy(grains: Grains, velocities: Array) -> Float[Array, ""]:
 def relative_momentum(grains: Grains, velocities: Array) -> Float[Array, ""]:
     """Total momentum over the sum of the momenta of the grains, |Σ m c| / Σ m |c|; zero at rest."""
     momenta = grains.masses[:, None] * velocities
-    momenta = lax.stop_gradient(momenta)  # it measures rounding, and a norm has no derivative at rest
+    momenta = lax.stop_gradient(
+        momenta
+    )  # it measures rounding, and a norm has no derivative at rest
     scale = jnp.sum(jnp.linalg.norm(momenta, axis=-1))
     return jnp.linalg.norm(jnp.sum(momenta, axis=0)) / jnp.where(scale > 0, scale, 1)
 
 
 def status_if_finite(*values: Array) -> Int[Array, ""]:
-    """``Status.ok`` if all numbers are finite, or else ``Status.nonfinite``; the values have one shape."""
+    """``Status.ok`` if all numbers are finite, or else ``Status.nonfinite``; the values have one
+    shape.
+    """
     finite = jnp.all(jnp.isfinite(jnp.stack(values)))
     return jnp.where(finite, Status.ok, Status.nonfinite).astype(jnp.int32)

@@ -14,9 +14,13 @@ class Status(IntEnum):
     ok = 0
     iteration_limit = 1  # a contact solve ended above the tolerance
     strain_limit = 2  # the sample reached its longest strain before the requested error
-    short_sample = 3  # the sample lasts only a few correlation strains, so its errors may be too small
+    short_sample = (
+        3  # the sample lasts only a few correlation strains, so its errors may be too small
+    )
     not_steady = 4  # the flow was not shown to be steady
-    deep_overlap = 5  # more than a tenth of the contacts overlapped by more than 1e-2 mean diameters
+    deep_overlap = (
+        5  # more than a tenth of the contacts overlapped by more than 1e-2 mean diameters
+    )
     infeasible = 6  # no impulses satisfy the contact law: the packing is jammed
     capacity = 7  # more pairs or contacts than the buffers hold
     nonfinite = 8  # a position, velocity or impulse is not a finite number
@@ -29,14 +33,20 @@ DEEP_SHARE = 0.1  # of the contacts; up to twice this share, stresses change by 
 
 MEANINGS = {
     "iteration_limit": "some contact solve ended above the tolerance",
-    "strain_limit": "the longest strain was sampled before the error was reached, take more seeds or a larger error",
-    "short_sample": "the sample lasts only a few correlation strains, so its errors may be too small",
-    "not_steady": "temperature or pressure still drifted, sample longer, or prepare longer by `equilibrate`",
-    "deep_overlap": "more than a tenth of the contacts overlap by more than 1e-2 diameters, take a shorter time step",
-    "infeasible": "no impulses satisfy the contact law, the packing is jammed, lower the packing fraction",
+    "strain_limit": "the longest strain was sampled before the error was reached, take more seeds "
+    "or a larger error",
+    "short_sample": "the sample lasts only a few correlation strains, so its errors may be too "
+    "small",
+    "not_steady": "temperature or pressure still drifted, sample longer, or prepare longer by "
+    "`equilibrate`",
+    "deep_overlap": "more than a tenth of the contacts overlap by more than 1e-2 diameters, take a "
+    "shorter time step",
+    "infeasible": "no impulses satisfy the contact law, the packing is jammed, lower the packing "
+    "fraction",
     "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",
     "nonfinite": "a position, velocity or impulse is not a finite number",
-    "failed": "workers of a cluster died of it, perhaps for lack of memory; pass `resume=True` to try once more",
+    "failed": "workers of a cluster died of it, perhaps for lack of memory; pass `resume=True` to "
+    "try once more",
     "not_run": "the point was not run",
 }
 """What each status means for a user, and what to do."""

@@ -1,7 +1,8 @@
 """One file for a browser: Plotly, scripts, style and data in a page that asks for nothing else.
 
-Names and attributes of a file are text to a page, never markup. The data stand in it as JSON whose ``<``, ``>`` and
-``&`` are escaped. The scripts put them into the page by ``textContent``. And the page forbids itself every request.
+Names and attributes of a file are text to a page, never markup. The data stand in it as JSON whose
+``<``, ``>`` and ``&`` are escaped. The scripts put them into the page by ``textContent``. And the
+page forbids itself every request.
 """
 
 import base64

@@ -1,4 +1,6 @@
-"""The data of the page of a map: every average at every point, with its errors, theory and status, and the instants."""
+"""The data of the page of a map: every average at every point, with its errors, theory and status,
+and the instants.
+"""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -33,26 +35,32 @@ _COMPANIONS = ("_stderr", "_ci95")
 _FIRST = ("force_ratio", "excess")  # the page opens with the second
 _GROUPS = ("stresses/", "theory/", "diagnostics/")
 _LEFT_OUT = ("status", "point_grains")
-_NAMED = {name: one.kind for name, one in options("run").items() if isinstance(one.kind, tuple)}  # choices of a run
+_NAMED = {
+    name: one.kind for name, one in options("run").items() if isinstance(one.kind, tuple)
+}  # choices of a run
 
 
 def map_data(data: MapData) -> dict[str, Any]:
-    """The numbers of a map in types of JSON, by point: number of grains, time step, packing fraction, restitution.
+    """The numbers of a map in types of JSON, by point: number of grains, time step, packing
+    fraction, restitution.
 
-    =============  =====================================================================================
+    =============  =================================================================================
     key            content
-    =============  =====================================================================================
-    axes           the dimensions, outermost first: name, label and values; numbers of grains and time
+    =============  =================================================================================
+    axes           the dimensions, outermost first: name, label and values; numbers of grains and
+                   time
                    steps have one value if the map has one, and none if it is not known
     observables    name, meaning and unit; values; and where the map has them standard errors, whole
                    errors, predictions of kinetic theory and numbers of effective samples
     status         the status of each point; meanings of the statuses
     grains         the number of grains of each point, if it was chosen by point
     instants       grains and forces of each point, see ``grain_data``
-    reference      what the reference map says of each packing fraction and restitution, see ``verdicts``
-    again          what the command needs that measures a point again, if the map was made by this program
+    reference      what the reference map says of each packing fraction and restitution, see
+                   ``verdicts``
+    again          what the command needs that measures a point again, if the map was made by this
+                   program
     about, notes   sentences: parameters of the map, and what is left out
-    =============  =====================================================================================
+    =============  =================================================================================
 
     Raises:
       InputError: (a ValueError) the data are no map, or have nothing to show.
@@ -63,16 +71,25 @@ def map_data(data: MapData) -> dict[str, Any]:
     data = _with_excess(data)
     names = [str(name) for name in data.data_vars if _is_shown(data, str(name))]
     names.sort(key=lambda name: _FIRST.index(name) if name in _FIRST else len(_FIRST))
-    observables = [one for name, label in _labels(names).items() for one in _observables(data, name, label, dims)]
+    observables = [
+        one
+        for name, label in _labels(names).items()
+        for one in _observables(data, name, label, dims)
+    ]
     if not observables:
         raise InputError("data must be a ratio map, and it has no number at its points.")
     instants, more = _instants(data, dims)
     return {
         "title": _text(data.attrs.get("title", "Map of sheared grains")),
-        "axes": [{"name": name, "label": label, "values": _axis(data, name)} for name, label in _AXES.items()],
+        "axes": [
+            {"name": name, "label": label, "values": _axis(data, name)}
+            for name, label in _AXES.items()
+        ],
         "observables": observables,
         "status": _statuses(data, dims),
-        "grains": numbers(_column(data["point_grains"], data, dims)) if "point_grains" in data else None,
+        "grains": numbers(_column(data["point_grains"], data, dims))
+        if "point_grains" in data
+        else None,
         "meanings": MEANINGS,
         "excessLevels": list(EXCESS_LEVELS),
         "instants": instants,
@@ -90,7 +107,8 @@ def _thinned(data: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
     parts, points = int(np.prod(sizes[:2])), int(np.prod(sizes))
     if parts > _MOST_PARTS:
         raise InputError(
-            f"a page shows at most {_MOST_PARTS} numbers of grains and time steps together, not {parts}: select some."
+            f"a page shows at most {_MOST_PARTS} numbers of grains and time steps together, not "
+            f"{parts}: select some."
         )
     if points <= MOST_POINTS:
         return data, []
@@ -99,9 +117,16 @@ def _thinned(data: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
     few_rows = max(min(rows, int(np.sqrt(most * rows / columns))), min(rows, most // columns), 1)
     few_columns = min(columns, max(most // few_rows, 1))
     for name, few in zip(_PLANE, (min(few_rows, most), few_columns), strict=True):
-        data = data.isel({name: np.unique(np.linspace(0, data.sizes[name] - 1, few).round().astype(int))})
-    shown = f"{data.sizes['packing_fraction']} of {rows} packing fractions and {data.sizes['restitution']} of {columns}"
-    return data, [f"The map has {points} points. This page shows a part of them: {shown} restitutions."]
+        data = data.isel(
+            {name: np.unique(np.linspace(0, data.sizes[name] - 1, few).round().astype(int))}
+        )
+    shown = (
+        f"{data.sizes['packing_fraction']} of {rows} packing fractions and "
+        f"{data.sizes['restitution']} of {columns}"
+    )
+    return data, [
+        f"The map has {points} points. This page shows a part of them: {shown} restitutions."
+    ]
 
 
 def _with_excess(data: xr.Dataset) -> xr.Dataset:
@@ -109,7 +134,11 @@ def _with_excess(data: xr.Dataset) -> xr.Dataset:
     if "force_ratio" not in data or "excess" in data:
         return data
     excess = (data.force_ratio - 1).assign_attrs(long_name="force ratio − 1", units="1")
-    errors = {f"excess{end}": data[f"force_ratio{end}"] for end in _COMPANIONS if f"force_ratio{end}" in data}
+    errors = {
+        f"excess{end}": data[f"force_ratio{end}"]
+        for end in _COMPANIONS
+        if f"force_ratio{end}" in data
+    }
     return data.assign({"excess": excess, **errors})
 
 
@@ -120,10 +149,16 @@ def _is_shown(data: xr.Dataset, name: str) -> bool:
     belongs = any(name.endswith(end) and name.removesuffix(end) in data for end in _COMPANIONS)
     belongs |= name.startswith("theory/") and path_of(name.removeprefix("theory/")) in data
     apart = name in _LEFT_OUT or name.startswith("states/") or "flag_values" in variable.attrs
-    return variable.dtype.kind in "iuf" and dims in ({*_PLANE}, {*_PLANE, *TENSOR_AXES}) and not (belongs or apart)
+    return (
+        variable.dtype.kind in "iuf"
+        and dims in ({*_PLANE}, {*_PLANE, *TENSOR_AXES})
+        and not (belongs or apart)
+    )
 
 
-def _observables(data: xr.Dataset, name: str, label: str, dims: list[str]) -> Iterator[dict[str, Any]]:
+def _observables(
+    data: xr.Dataset, name: str, label: str, dims: list[str]
+) -> Iterator[dict[str, Any]]:
     """The entry of a variable, or those of its components."""
     about = data[name].attrs
     parts = {"value": name, "error": f"{name}_stderr", "whole": f"{name}_ci95"}
@@ -131,20 +166,25 @@ def _observables(data: xr.Dataset, name: str, label: str, dims: list[str]) -> It
     samples = _effective_samples(data, label)
     for component, chosen in _components(data[name]).items():
         columns = {
-            part: _column(data[there].isel(chosen), data, dims) for part, there in parts.items() if there in data
+            part: _column(data[there].isel(chosen), data, dims)
+            for part, there in parts.items()
+            if there in data
         }
         if samples is not None:
             columns["samples"] = _column(samples, data, dims)
         yield {
             "name": _text(label + component),
-            "meaning": _text(about.get("long_name", label.replace("_", " "))) + component.replace("_", ", "),
+            "meaning": _text(about.get("long_name", label.replace("_", " ")))
+            + component.replace("_", ", "),
             "unit": unit_text(_text(about.get("reduced_unit", about.get("units", "")))),
             **{part: numbers(values) for part, values in columns.items()},
         }
 
 
 def _effective_samples(data: xr.Dataset, observable: str) -> xr.DataArray | None:
-    """The number of independent samples of an observable at each point, or None where it is not known."""
+    """The number of independent samples of an observable at each point, or None where it is not
+    known.
+    """
     strain, correlated = data.get("seeds/strain"), data.get("diagnostics/correlation_strain")
     if strain is None or correlated is None or observable not in data.get("observable", ()):
         return None
@@ -152,10 +192,17 @@ def _effective_samples(data: xr.Dataset, observable: str) -> xr.DataArray | None
 
 
 def _labels(names: list[str]) -> dict[str, str]:
-    """Short names of variables: without their group, or with it at the end where another one has the same name."""
-    split = {name: (name.split("/", 1) if name.startswith(_GROUPS) else ["", name]) for name in names}
+    """Short names of variables: without their group, or with it at the end where another one has
+    the same name.
+    """
+    split = {
+        name: (name.split("/", 1) if name.startswith(_GROUPS) else ["", name]) for name in names
+    }
     counts = Counter(end for _, end in split.values())
-    return {name: f"{end}_{group}" if group and counts[end] > 1 else end for name, (group, end) in split.items()}
+    return {
+        name: f"{end}_{group}" if group and counts[end] > 1 else end
+        for name, (group, end) in split.items()
+    }
 
 
 def _components(variable: xr.DataArray) -> dict[str, dict[str, int]]:
@@ -163,11 +210,17 @@ def _components(variable: xr.DataArray) -> dict[str, dict[str, int]]:
     if not set(TENSOR_AXES) <= set(variable.dims):
         return {"": {}}
     sizes = [variable.sizes[axis] for axis in TENSOR_AXES]
-    return {f"_{'xyz'[a]}{'xyz'[b]}": {"axis_a": a, "axis_b": b} for a, b in np.ndindex(*sizes) if max(a, b) < 3}
+    return {
+        f"_{'xyz'[a]}{'xyz'[b]}": {"axis_a": a, "axis_b": b}
+        for a, b in np.ndindex(*sizes)
+        if max(a, b) < 3
+    }
 
 
 def _column(variable: xr.DataArray, data: xr.Dataset, dims: list[str]) -> np.ndarray:
-    """The values of a variable by point, or the total of an interval; one without numbers of grains is repeated."""
+    """The values of a variable by point, or the total of an interval; one without numbers of grains
+    is repeated.
+    """
     if "error_source" in variable.dims:
         variable = variable.sel(error_source="total")
     missing = {name: data[name] for name in dims if name not in variable.dims}
@@ -184,15 +237,26 @@ def _statuses(data: xr.Dataset, dims: list[str]) -> list[str]:
     return [_text(names.get(code, f"status {code:g}")) for code in codes.tolist()]
 
 
-def _instants(data: xr.Dataset, dims: list[str]) -> tuple[list[dict[str, Any] | None] | None, list[str]]:
-    """Grains and forces of every point, and a sentence if some are left out; None if the map has none."""
+def _instants(
+    data: xr.Dataset, dims: list[str]
+) -> tuple[list[dict[str, Any] | None] | None, list[str]]:
+    """Grains and forces of every point, and a sentence if some are left out; None if the map has
+    none.
+    """
     if not any(name.startswith("states/") for name in map(str, data.data_vars)):
         return None, []
     from jaxgran.maps.states import VARIABLES, instant_at, state_of  # here, as only this needs JAX
 
-    timesteps, values = _axis(data, "timestep"), {name: data.get(f"states/{name}") for name in VARIABLES}
+    timesteps, values = (
+        _axis(data, "timestep"),
+        {name: data.get(f"states/{name}") for name in VARIABLES},
+    )
     activation = data.attrs.get("activation")
-    if not timesteps or activation not in _NAMED["activation"] or any(x is None for x in values.values()):
+    if (
+        not timesteps
+        or activation not in _NAMED["activation"]
+        or any(x is None for x in values.values())
+    ):
         return None, []
     found, large = [], 0
     for place in np.ndindex(*(data.sizes[name] for name in dims)):
@@ -205,16 +269,24 @@ def _instants(data: xr.Dataset, dims: list[str]) -> tuple[list[dict[str, Any] | 
         alpha, nu = (data[name].values[here[name]] for name in ("restitution", "packing_fraction"))
         timestep = timesteps[here.get("timestep", 0)]
         one = instant_at(state, float(alpha), float(nu), timestep, activation)
-        found.append(None if one is None else grain_data(**one._asdict(), scale=scale_of(one.speed, one.force)))
+        found.append(
+            None
+            if one is None
+            else grain_data(**one._asdict(), scale=scale_of(one.speed, one.force))
+        )
     return found, [f"Instants of more than {MOST_GRAINS} grains are not drawn."] if large else []
 
 
 def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
-    """Seeds, sampled strain of a seed at every point with a value, and options; None if the file lacks them.
+    """Seeds, sampled strain of a seed at every point with a value, and options; None if the file
+    lacks them.
 
     The reader pastes the command into a shell, so it contains only numbers and known names.
     """
-    if not {"seeds", "tolerance", *_NAMED} <= data.attrs.keys() | {"engine"} or "seeds/strain" not in data:
+    if (
+        not {"seeds", "tolerance", *_NAMED} <= data.attrs.keys() | {"engine"}
+        or "seeds/strain" not in data
+    ):
         return None
     chosen = {}
     for name, accepted in _NAMED.items():
@@ -231,18 +303,29 @@ def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
     except (TypeError, ValueError):
         return None
     words = [f"--{name} {value}" for name, value in chosen.items() if value != "auto"]
-    strain = _column(data["seeds/strain"].mean("seed").where(np.isfinite(data.force_ratio)), data, dims)
+    strain = _column(
+        data["seeds/strain"].mean("seed").where(np.isfinite(data.force_ratio)), data, dims
+    )
     return {"seeds": seeds, "options": " ".join(words), "strain": numbers(strain)}
 
 
 def _about(data: xr.Dataset) -> str:
     """A sentence with the parameters that the axes do not show."""
-    words = {"activation": "{} activation", "seeds": "{} seed" if data.attrs.get("seeds") == 1 else "{} seeds"}
-    return _text(", ".join(form.format(data.attrs[name]) for name, form in words.items() if name in data.attrs))
+    words = {
+        "activation": "{} activation",
+        "seeds": "{} seed" if data.attrs.get("seeds") == 1 else "{} seeds",
+    }
+    return _text(
+        ", ".join(
+            form.format(data.attrs[name]) for name, form in words.items() if name in data.attrs
+        )
+    )
 
 
 def _axis(data: xr.Dataset, name: str) -> list[float]:
-    """The values of a dimension; for the number of grains and the time step of a map that has one, its attribute."""
+    """The values of a dimension; for the number of grains and the time step of a map that has one,
+    its attribute.
+    """
     if name in data.dims:
         return data[name].values.tolist()
     value = np.ravel(data.attrs.get(name, []))

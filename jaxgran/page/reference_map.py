@@ -1,4 +1,6 @@
-"""The reference map for a page: as a dataset to look into, and its verdicts at the points of any map."""
+"""The reference map for a page: as a dataset to look into, and its verdicts at the points of any
+map.
+"""
 
 from typing import Any
 
@@ -17,7 +19,9 @@ _PATHS = {f"pressure_{name}": f"theory/enskog_factor_pressure_{name}" for name i
 
 
 def reference_dataset() -> xr.Dataset:
-    """The averages of the reference map by packing fraction and restitution, with errors, and kinetic theory."""
+    """The averages of the reference map by packing fraction and restitution, with errors, and
+    kinetic theory.
+    """
     table = shipped_table()
     flows = [table.columns[name] for name in _PLANE]
     axes, places = zip(*(np.unique(x, return_inverse=True) for x in flows), strict=True)
@@ -41,9 +45,17 @@ def reference_dataset() -> xr.Dataset:
         put(f"theory/{name}", np.exp(values))
     found = validity(*reversed(flows))
     for name, error in found.error.items():
-        put(f"{name}_error_of_theory", error, long_name="kinetic theory over measured average, less one")
+        put(
+            f"{name}_error_of_theory",
+            error,
+            long_name="kinetic theory over measured average, less one",
+        )
         put(f"{name}_error_of_theory_ci95", found.error_ci95[name])
-    numbers = {name: float(x) for name, x in table.head.items() if name in ("grains", "timestep") and _is_number(x)}
+    numbers = {
+        name: float(x)
+        for name, x in table.head.items()
+        if name in ("grains", "timestep") and _is_number(x)
+    }
     attributes = {"title": f"The reference map of jaxgran: {table.made_with}", **numbers}
     return xr.Dataset(variables, dict(zip(_PLANE, axes, strict=True)), attributes)
 
@@ -71,7 +83,9 @@ def verdicts(packing_fractions: np.ndarray, restitutions: np.ndarray) -> dict[st
     table = shipped_table()
     nus, alphas = (x.ravel() for x in np.meshgrid(packing_fractions, restitutions, indexing="ij"))
     (first, last), (loosest, densest) = table.range("restitution"), table.range("packing_fraction")
-    inside = np.flatnonzero((first <= alphas) & (alphas <= last) & (loosest <= nus) & (nus <= densest))
+    inside = np.flatnonzero(
+        (first <= alphas) & (alphas <= last) & (loosest <= nus) & (nus <= densest)
+    )
     flows: list[dict[str, Any] | None] = [None] * len(nus)
     if inside.size:
         found = validity(alphas[inside], nus[inside])
@@ -79,9 +93,11 @@ def verdicts(packing_fractions: np.ndarray, restitutions: np.ndarray) -> dict[st
             one = found.at(place)
             flows[flow] = {"verdict": one.verdict(), "rows": one.rows()}
     return {
-        "about": f"Reference map: {table.made_with}, diameters uniform in σ ± {table.head['polydispersity']} σ; "
+        "about": f"Reference map: {table.made_with}, diameters uniform in σ ± "
+        f"{table.head['polydispersity']} σ; "
         "± is half of the 95 % interval for a large system.",
-        "outside": f"The reference map covers α = {first:g} to {last:g} and ν = {loosest:g} to {densest:g}.",
+        "outside": f"The reference map covers α = {first:g} to {last:g} and ν = {loosest:g} to "
+        f"{densest:g}.",
         "columns": list(COLUMNS),
         "flows": flows,
     }

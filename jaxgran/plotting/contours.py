@@ -1,6 +1,7 @@
 """Contours in the plane of 1 − α and ν, and those of the excess on top.
 
-A quantity is interpolated between the grid points of a map. A cell is hatched if one of its corners has no value.
+A quantity is interpolated between the grid points of a map. A cell is hatched if one of its corners
+has no value.
 """
 
 from __future__ import annotations
@@ -27,18 +28,29 @@ _EXCESS_COLOUR = "#00803c"
 _EXCESS_STYLE: dict[str, Any] = {"alpha": 0.75, "zorder": 2.5}
 _LEAST_ROOM = 0.045  # inches from a label to the next contour, or half of those to the frame
 _LETTER = 0.078  # inches, width of a letter of a label
-_LINEAR_BELOW = 0.01  # excess below which its contour variable is linear, above which it is logarithmic
-_DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": "0.25", "markersize": 2, "markeredgewidth": 0}
+_LINEAR_BELOW = (
+    0.01  # excess below which its contour variable is linear, above which it is logarithmic
+)
+_DOT: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "o",
+    "color": "0.25",
+    "markersize": 2,
+    "markeredgewidth": 0,
+}
 _CROSS: dict[str, Any] = {"linestyle": "none", "marker": "x", "color": "0.25", "markersize": 5}
 
 _Key = TypeVar("_Key", str, float)
 
 
-# ----------------------------------------------------------------------------------------------- plane
+# -----------------------------------------------------------------------------------------------
+# plane
 
 
 def contour_variable(excess: np.ndarray) -> np.ndarray:
-    """Return asinh(excess/0.01): monotone, nearly logarithmic above 0.01, and defined below zero."""
+    """Return asinh(excess/0.01): monotone, nearly logarithmic above 0.01, and defined below
+    zero.
+    """
     return np.arcsinh(excess / _LINEAR_BELOW)
 
 
@@ -60,9 +72,11 @@ def draw_levels(
     labelled: bool = True,
     **styles: Any,
 ) -> list[_Key]:
-    """Draw the contours of a field at increasing values, with their keys as labels; return the keys of those drawn.
+    """Draw the contours of a field at increasing values, with their keys as labels; return the keys
+    of those drawn.
 
-    A contour has no label if it is everywhere too close to others, to the frame or to another label.
+    A contour has no label if it is everywhere too close to others, to the frame or to another
+    label.
     """
     low, high = (field.min(), field.max()) if field.count() else (0.0, 0.0)
     crossed = [key for key, value in levels.items() if low < value < high]
@@ -70,7 +84,9 @@ def draw_levels(
         return []
     drawn = axes.contour(x, y, field, list(levels.values()), **styles)
     if labelled:
-        texts = {value: key if isinstance(key, str) else f"{key:.2f}" for key, value in levels.items()}
+        texts = {
+            value: key if isinstance(key, str) else f"{key:.2f}" for key, value in levels.items()
+        }
         places = _label_places(axes, drawn, x, y, [_LETTER * len(text) for text in texts.values()])
         for label in axes.clabel(
             drawn, fmt=texts, fontsize=SMALL_SIZE + 0.5, inline_spacing=2, manual=places, zorder=6
@@ -82,15 +98,20 @@ def draw_levels(
 def _label_places(
     axes: Axes, drawn: QuadContourSet, x: np.ndarray, y: np.ndarray, lengths: list[float]
 ) -> list[tuple[float, float]]:
-    """Return where each contour with room for a label has it: as far from the others and the frame as it can.
+    """Return where each contour with room for a label has it: as far from the others and the frame
+    as it can.
 
-    Lengths are in inches, before the panel has its final size. Contours with the least room have their labels first.
-    Middles of labels are as far apart as the mean of their lengths, so that they do not touch in whatever directions.
+    Lengths are in inches, before the panel has its final size. Contours with the least room have
+    their labels first. Middles of labels are as far apart as the mean of their lengths, so that
+    they do not touch in whatever directions.
     """
     corner, scale = np.array([x.min(), y.min()]), np.array([np.ptp(x), np.ptp(y)])
     scale = scale / (np.array(axes.bbox.size) / axes.figure.dpi)
     end = np.array([np.ptp(x), np.ptp(y)]) / scale
-    curves = [(np.asarray(path.vertices) - corner)[:: 1 + len(path) // 200] / scale for path in drawn.get_paths()]
+    curves = [
+        (np.asarray(path.vertices) - corner)[:: 1 + len(path) // 200] / scale
+        for path in drawn.get_paths()
+    ]
     clearances = []
     for k, curve in enumerate(curves):
         others = np.concatenate([np.full((1, 2), np.inf), *curves[:k], *curves[k + 1 :]])
@@ -101,12 +122,18 @@ def _label_places(
         between = np.linalg.norm(curves[k][:, None] - places, axis=-1) - (placed + lengths[k]) / 2
         clearance = np.where(between.min(axis=1, initial=np.inf) > 0, clearances[k], 0)
         if clearance.max(initial=0) > _LEAST_ROOM:
-            places, placed = np.vstack([places, curves[k][clearance.argmax()]]), np.append(placed, lengths[k])
+            places, placed = (
+                np.vstack([places, curves[k][clearance.argmax()]]),
+                np.append(placed, lengths[k]),
+            )
     return [tuple(place) for place in corner + scale * places]
 
 
-def draw_plane(axes: Axes, data: xr.Dataset, field: np.ma.MaskedArray, measured: np.ndarray) -> None:
-    """Hatch the area without interpolated values, and draw measured points as dots and missing ones as crosses.
+def draw_plane(
+    axes: Axes, data: xr.Dataset, field: np.ma.MaskedArray, measured: np.ndarray
+) -> None:
+    """Hatch the area without interpolated values, and draw measured points as dots and missing ones
+    as crosses.
 
     Points whose status is not `ok` get a ring.
     """
@@ -124,15 +151,24 @@ def draw_plane(axes: Axes, data: xr.Dataset, field: np.ma.MaskedArray, measured:
     mark_bad(axes, x[bad], y[bad], clip_on=False)
 
 
-def add_plane_legend(figure: Figure, data: xr.Dataset, measured: np.ndarray, entries: Iterable[Artist] = ()) -> None:
-    """Explain above the axes the symbols that occur in a plane. Further entries stand between the dot and the ring."""
-    dot, cross = Line2D([], [], **_DOT, label="measured"), Line2D([], [], **_CROSS, label="no value")
+def add_plane_legend(
+    figure: Figure, data: xr.Dataset, measured: np.ndarray, entries: Iterable[Artist] = ()
+) -> None:
+    """Explain above the axes the symbols that occur in a plane. Further entries stand between the
+    dot and the ring.
+    """
+    dot, cross = (
+        Line2D([], [], **_DOT, label="measured"),
+        Line2D([], [], **_CROSS, label="no value"),
+    )
     handles = [dot] * bool(measured.any()) + list(entries)
     handles += [ring_key()] * bool(suspect(data).any()) + [cross] * (not measured.all())
     figure.legend(
         handles=handles,
         loc="outside upper center",
-        ncols=len(handles) if len(handles) <= figure.get_figwidth() else math.ceil(len(handles) / 2),
+        ncols=len(handles)
+        if len(handles) <= figure.get_figwidth()
+        else math.ceil(len(handles) / 2),
         fontsize=SMALL_SIZE,
         frameon=False,
         handlelength=1.2,
@@ -140,11 +176,14 @@ def add_plane_legend(figure: Figure, data: xr.Dataset, measured: np.ndarray, ent
     )
 
 
-# ---------------------------------------------------------------------------------------------- excess
+# ----------------------------------------------------------------------------------------------
+# excess
 
 
 def draw_excess(axes: Axes, data: xr.Dataset) -> list[float]:
-    """Draw the contours of the excess of the force ratio on top of another field, wider for a larger excess."""
+    """Draw the contours of the excess of the force ratio on top of another field, wider for a
+    larger excess.
+    """
     x, y = refined_axes(data)
     widths = [_excess_width(level) for level in EXCESS_LEVELS]
     style = {"colors": _EXCESS_COLOUR, "linewidths": widths, **_EXCESS_STYLE}

@@ -1,7 +1,8 @@
 """What all figures share: size, fonts, point markers, legends, captions and files.
 
-A figure is one or two columns of a journal wide, and its text has at least 7 points at that width. ``STYLE`` says how
-all look, and ``styled`` gives it to a function that draws. No plotting state remains changed, and no display is needed.
+A figure is one or two columns of a journal wide, and its text has at least 7 points at that width.
+``STYLE`` says how all look, and ``styled`` gives it to a function that draws. No plotting state
+remains changed, and no display is needed.
 """
 
 from __future__ import annotations
@@ -24,13 +25,20 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
-from matplotlib.ticker import LogFormatterSciNotation, LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import (
+    LogFormatterSciNotation,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+    StrMethodFormatter,
+)
 
 from jaxgran.files import atomic_write
 from jaxgran.maps.schema import FINEST
 from jaxgran.model.checks import InputError, short_repr
 
-LONGEST_NAME = 200  # bytes of a stem; file systems accept 255, and the names of figures are longer than their stem
+# bytes of a stem; file systems accept 255, and the names of figures are longer than their stem
+LONGEST_NAME = 200
 ONE_COLUMN, TWO_COLUMNS = 8.5 / 2.54, 17 / 2.54  # inches, width of a figure
 FILE_DPI = 200  # dots per inch of a picture, unless another number is given
 LABEL_SIZE = 8.0  # points, font of the labels of axes
@@ -56,7 +64,10 @@ STYLE: dict[Any, Any] = {
     "lines.markersize": 4.0,
     "errorbar.capsize": 0.0,
 }
-PANEL_TITLE: dict[str, Any] = {"fontsize": LABEL_SIZE, "y": 1.0}  # a fixed height: Matplotlib would search for one
+PANEL_TITLE: dict[str, Any] = {
+    "fontsize": LABEL_SIZE,
+    "y": 1.0,
+}  # a fixed height: Matplotlib would search for one
 ALPHA_TITLE = "restitution α"
 ALPHA_LABEL = r"$1-\alpha$"
 NU_LABEL = r"packing fraction $\nu$"
@@ -67,7 +78,9 @@ R = TypeVar("R")
 _CAPTION = "caption"  # id of the text under the axes
 _USUAL_LINES = 3  # of a caption; a figure with more is higher
 _LINE_HEIGHT = 0.13  # inches
-_MANY_DECADES = 200  # largest over smallest value at and above which only powers of ten have numbers
+_MANY_DECADES = (
+    200  # largest over smallest value at and above which only powers of ten have numbers
+)
 _NARROW = 4  # largest over smallest value at and below which numbers have equal steps
 _LEAST_PLAIN = 1e-3  # smallest number that is written without a power of ten
 _SAVED: dict[str, dict[str, Any]] = {
@@ -87,19 +100,28 @@ _RING: dict[str, Any] = {
 }
 
 
-# ---------------------------------------------------------------------------------------------- data
+# ----------------------------------------------------------------------------------------------
+# data
 
 
 def ordered(data: xr.Dataset, *names: str) -> xr.Dataset:
-    """Return force ratio, status and the named variables, with errors, as (..., packing_fraction, restitution).
+    """Return force ratio, status and the named variables, with errors, as (..., packing_fraction,
+    restitution).
 
-    Numbers of grains and time steps, if there are several, come first. The values of all axes increase. Variables that
-    the map does not have are left out.
+    Numbers of grains and time steps, if there are several, come first. The values of all axes
+    increase. Variables that the map does not have are left out.
     """
     values = ("force_ratio", *names)
-    kept = [name for name in (*values, *(f"{name}_stderr" for name in values), "status") if name in data]
+    kept = [
+        name for name in (*values, *(f"{name}_stderr" for name in values), "status") if name in data
+    ]
     dims = [name for name in (*FINEST, "packing_fraction", "restitution") if name in data.dims]
-    return data[kept].sortby(dims).transpose(*dims, ...).assign_attrs({"seeds": data.sizes.get("seed")} | data.attrs)
+    return (
+        data[kept]
+        .sortby(dims)
+        .transpose(*dims, ...)
+        .assign_attrs({"seeds": data.sizes.get("seed")} | data.attrs)
+    )
 
 
 def is_plane(data: xr.Dataset) -> bool:
@@ -129,14 +151,19 @@ def _status_names(data: xr.Dataset) -> np.ndarray:
     values = np.atleast_1d(attrs["flag_values"]).tolist()
     names = dict(zip(values, attrs["flag_meanings"].split(), strict=True))
     codes = data.status.values
-    return np.array([names.get(code, f"status {code}") for code in codes.flat], object).reshape(codes.shape)
+    return np.array([names.get(code, f"status {code}") for code in codes.flat], object).reshape(
+        codes.shape
+    )
 
 
-# ---------------------------------------------------------------------------------------------- curves
+# ----------------------------------------------------------------------------------------------
+# curves
 
 
 def curve_styles(count: int) -> list[dict[str, Any]]:
-    """Return a colour, marker and line style for each curve; the colours also differ in a grey print."""
+    """Return a colour, marker and line style for each curve; the colours also differ in a grey
+    print.
+    """
     ramp = colormaps["viridis"](np.linspace(0.0, 0.82, count))
     return [
         {
@@ -151,7 +178,9 @@ def curve_styles(count: int) -> list[dict[str, Any]]:
 def draw_points(
     axes: Axes, x: np.ndarray, y: np.ndarray, bad: np.ndarray, style: dict[str, Any], **errors: Any
 ) -> None:
-    """Draw a curve with its error bars, without caps; a point whose status is not `ok` is an open symbol in a ring."""
+    """Draw a curve with its error bars, without caps; a point whose status is not `ok` is an open
+    symbol in a ring.
+    """
     axes.errorbar(x, y, **style, **errors, markersize=4, linewidth=1.1, elinewidth=0.8)
     axes.plot(
         x[bad],
@@ -167,7 +196,9 @@ def draw_points(
 
 
 def mark_bad(axes: Axes, x: np.ndarray, y: np.ndarray, clip_on: bool = True) -> None:
-    """Put a ring around points whose status is not `ok`; unless it is clipped, it may reach over the frame."""
+    """Put a ring around points whose status is not `ok`; unless it is clipped, it may reach over
+    the frame.
+    """
     if len(x):
         axes.plot(x, y, **_RING, zorder=5, clip_on=clip_on)
 
@@ -182,7 +213,9 @@ def ring_key() -> Line2D:
     return Line2D([], [], **_RING, label="status not ok")
 
 
-def add_curve_legend(figure: Figure, data: xr.Dataset, handles: Sequence[Line2D], title: str) -> None:
+def add_curve_legend(
+    figure: Figure, data: xr.Dataset, handles: Sequence[Line2D], title: str
+) -> None:
     """Name the curves beside the axes, and explain the ring above them."""
     figure.legend(
         handles=handles,
@@ -203,20 +236,26 @@ def add_ring_legend(figure: Figure, data: xr.Dataset, place: Any = "outside uppe
         figure.legend(handles=[ring_key()], loc=place, fontsize=SMALL_SIZE, frameon=False)
 
 
-# ---------------------------------------------------------------------------------------------- forces
+# ----------------------------------------------------------------------------------------------
+# forces
 
 
 def image_segments(starts: np.ndarray, branches: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-    """Return the ends (images · pairs, 2, 2) of lines from ``starts`` along ``branches``, at each of the ``shifts``."""
+    """Return the ends (images · pairs, 2, 2) of lines from ``starts`` along ``branches``, at each
+    of the ``shifts``.
+    """
     segments = np.stack([starts, starts + branches], axis=1)
     return (segments[None] + shifts[:, None, None]).reshape(-1, 2, 2)
 
 
-# ------------------------------------------------------------------------------------- frame and text
+# ------------------------------------------------------------------------------------- frame and
+# text
 
 
 class ShownFigure(Figure):
-    """A figure that a notebook shows if it is the last line of a cell, without any global plotting state."""
+    """A figure that a notebook shows if it is the last line of a cell, without any global plotting
+    state.
+    """
 
     def _repr_png_(self) -> bytes:
         memory = BytesIO()
@@ -243,17 +282,22 @@ def empty_figure(width: float, height: float) -> Figure:
 
 
 def label_log_axis(axis: Axis, most: int = 9) -> None:
-    """Put numbers at 1, 2 and 5 of each decade of a logarithmic axis, at powers of ten, or at equal steps.
+    """Put numbers at 1, 2 and 5 of each decade of a logarithmic axis, at powers of ten, or at equal
+    steps.
 
-    Powers of ten are those of several decades, and where 1, 2 and 5 are more than `most` numbers; equal steps are those
-    of a small part of a decade.
+    Powers of ten are those of several decades, and where 1, 2 and 5 are more than `most` numbers;
+    equal steps are those of a small part of a decade.
     """
     low, high = axis.get_view_interval()
     every = LogFormatterSciNotation(minor_thresholds=(np.inf, np.inf))
-    numbers = np.outer(10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high))), (1, 2, 5))
+    numbers = np.outer(
+        10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high))), (1, 2, 5)
+    )
     fit = ((low <= numbers) & (numbers <= high)).sum() <= most
     in_a_decade = (1, 2, 5) if fit and high < _MANY_DECADES * low else (1,)
-    axis.set_major_locator(LogLocator(subs=in_a_decade, numticks=9) if high > _NARROW * low else MaxNLocator(4))
+    axis.set_major_locator(
+        LogLocator(subs=in_a_decade, numticks=9) if high > _NARROW * low else MaxNLocator(4)
+    )
     axis.set_major_formatter(every if low < _LEAST_PLAIN else StrMethodFormatter("{x:g}"))
     axis.set_minor_formatter(NullFormatter())
 
@@ -266,7 +310,9 @@ def scientific(value: float) -> str:
 
 
 def status_note(data: xr.Dataset) -> str:
-    """Return a line that counts the points of each status that is not `ok`; empty if there are none."""
+    """Return a line that counts the points of each status that is not `ok`; empty if there are
+    none.
+    """
     counts = Counter(name for name in _status_names(data).flat if name != "ok")
     words = ", ".join(f"{name.replace('_', ' ')} ({count})" for name, count in counts.most_common())
     return f"Status not ok: {words}" if counts else ""
@@ -285,7 +331,9 @@ def padded(values: np.ndarray) -> tuple[float, float]:
 
 
 def finish(figure: Figure, data: xr.Dataset, measured: np.ndarray, notes: Sequence[str]) -> None:
-    """Set the tick style and write the caption under the axes; write "no measured values" where there are none."""
+    """Set the tick style and write the caption under the axes; write "no measured values" where
+    there are none.
+    """
     for axes in figure.axes:
         axes.tick_params(which="both", direction="in", top=True, right=True, labelsize=TICK_SIZE)
         if not measured.any():
@@ -300,7 +348,9 @@ def finish(figure: Figure, data: xr.Dataset, measured: np.ndarray, notes: Sequen
 
 
 def _wrapped(text: Text, words: str, most: float) -> list[str]:
-    """Return words in lines of at most so many pixels as the text would draw them; formulas stay whole."""
+    """Return words in lines of at most so many pixels as the text would draw them; formulas stay
+    whole.
+    """
     lines: list[str] = []
     for word in re.findall(r"(?:\$[^$]*\$|\S)+", words):
         text.set_text(f"{lines[-1]} {word}" if lines else word)
@@ -312,10 +362,14 @@ def _wrapped(text: Text, words: str, most: float) -> list[str]:
 
 
 def _run_description(attrs: dict) -> str:
-    """Return in one line the parameters on which a force ratio depends; what has several values is shown by an axis."""
+    """Return in one line the parameters on which a force ratio depends; what has several values is
+    shown by an axis.
+    """
     parts = []
     if "grains_by_point" in attrs:
-        parts.append(f"$N={np.min(attrs['grains_by_point'])}$ to ${np.max(attrs['grains_by_point'])}$")
+        parts.append(
+            f"$N={np.min(attrs['grains_by_point'])}$ to ${np.max(attrs['grains_by_point'])}$"
+        )
     elif np.ndim(attrs.get("grains", ())) == 0:
         parts.append(f"$N={attrs['grains']}$")
     if attrs.get("seeds") is not None:
@@ -330,17 +384,23 @@ def _run_description(attrs: dict) -> str:
 
 
 def writable_stem(stem: Path | str) -> Path:
-    """Return folder and beginning of the names of figures; raise an InputError if no file can be written there."""
+    """Return folder and beginning of the names of figures; raise an InputError if no file can be
+    written there.
+    """
     if not isinstance(stem, (str, os.PathLike)):
-        raise InputError(f"stem must be folder and beginning of the file names, not {short_repr(stem)}.")
+        raise InputError(
+            f"stem must be folder and beginning of the file names, not {short_repr(stem)}."
+        )
     stem = Path(stem)
     if len(os.fsencode(stem.name)) > LONGEST_NAME:
         raise InputError(
-            f"the names of figures must begin with at most {LONGEST_NAME} bytes, not {short_repr(stem.name)}."
+            f"the names of figures must begin with at most {LONGEST_NAME} bytes, not "
+            f"{short_repr(stem.name)}."
         )
     if not os.path.isdir(stem.parent) or not os.access(stem.parent, os.W_OK):
         raise InputError(
-            f"figures must be written to a folder that can be written to, not {short_repr(str(stem.parent))}."
+            "figures must be written to a folder that can be written to, not "
+            f"{short_repr(str(stem.parent))}."
         )
     return stem
 
@@ -353,6 +413,9 @@ def write(figure: Figure, path: Path, dpi: int = FILE_DPI, caption: bool = True)
     kind = path.suffix.removeprefix(".")
     for text in figure.findobj(lambda artist: artist.get_gid() == _CAPTION):
         text.set_visible(caption)
-    with atomic_write(path) as temporary, rc_context({"svg.hashsalt": "jaxgran", "pdf.fonttype": 42}):
+    with (
+        atomic_write(path) as temporary,
+        rc_context({"svg.hashsalt": "jaxgran", "pdf.fonttype": 42}),
+    ):
         figure.savefig(temporary, format=kind, dpi=dpi, **_SAVED.get(kind, {}))
     return path

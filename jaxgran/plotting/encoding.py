@@ -1,11 +1,16 @@
-"""What figures, movies and pages draw alike: levels of contours, and the colours and widths of grains and forces."""
+"""What figures, movies and pages draw alike: levels of contours, and the colours and widths of
+grains and forces.
+"""
 
 import numpy as np
 
 EXCESS_LEVELS = (0.05, 0.10, 0.25, 0.50, 1.00)
 """Contour values of the excess of the force ratio over one, as in Figure 2."""
 
-GRAIN_RAMPS = {"speed": ["#ffffff", "#cfe4f0", "#8fbfd9"], "pressure": ["#ffffff", "#fbe3c0", "#eeb46c"]}
+GRAIN_RAMPS = {
+    "speed": ["#ffffff", "#cfe4f0", "#8fbfd9"],
+    "pressure": ["#ffffff", "#fbe3c0", "#eeb46c"],
+}
 GRAIN_EDGE = "#8c8c8c"
 CLUSTER_COLOUR = "#1a1a1a"
 BINARY_COLOUR = "#e0552f"

@@ -1,4 +1,6 @@
-"""The figure that says which assumption of kinetic theory fails where: its factors in the plane of 1 − α and ν."""
+"""The figure that says which assumption of kinetic theory fails where: its factors in the plane of
+1 − α and ν.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,10 @@ LENGTH_PANEL = r"(f) correlation length $L'/\sigma$"
 """Title of the last panel."""
 
 _NOTES = (
-    "Contact pressure: measured = Enskog × (a) × (b) × (c) × (d) × (e); (f) Γ over pressure, Enskog over measured",
+    (
+        "Contact pressure: measured = Enskog × (a) × (b) × (c) × (d) × (e); (f) Γ over pressure, "
+        "Enskog over measured"
+    ),
     "Black contours: factor or length, or less one in % (dashed where negative)",
 )
 _DRAWN = {f"theory/enskog_factor_pressure_{factor}": title for factor, title in PANELS.items()}
@@ -53,14 +58,15 @@ def has_factors(data: xr.Dataset) -> bool:
 def enskog_factors(data: MapData) -> Figure:
     """Return the factors by which the contact pressure differs from Enskog's, in the plane.
 
-    Each factor is the pressure with one more assumption replaced by what was measured, over the pressure before; the
-    last panel is the correlation length L′: see ``jaxgran.sampling.enskog_factors``. The axes are 1 − α and ν. Black
-    contours have the factor as their label; they are dashed where it is below one. In dotted areas it differs from one
-    by less than its standard error. Green contours show the excess of the force ratio.
+    Each factor is the pressure with one more assumption replaced by what was measured, over the
+    pressure before; the last panel is the correlation length L′: see
+    ``jaxgran.sampling.enskog_factors``. The axes are 1 − α and ν. Black contours have the factor as
+    their label; they are dashed where it is below one. In dotted areas it differs from one by less
+    than its standard error. Green contours show the excess of the force ratio.
 
     Args:
-      data: a map with `theory/enskog_factor_pressure_...`, `theory/correlation_length_from_pressure` and
-        `force_ratio`, with `_stderr`, and `status`.
+      data: a map with `theory/enskog_factor_pressure_...`,
+        `theory/correlation_length_from_pressure` and `force_ratio`, with `_stderr`, and `status`.
 
     Raises:
       InputError: (a ValueError) fewer than two restitutions or two packing fractions.
@@ -86,5 +92,10 @@ def enskog_factors(data: MapData) -> Figure:
         axes.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
     add_plane_legend(figure, data, measured, [*(noise_keys() if noisy else []), *excess_keys(over)])
     found = left_out_note(data, fields, "each factor")
-    finish(figure, data, measured, [*_NOTES, found, status_note(data), missing_note(measured, " (hatched)")])
+    finish(
+        figure,
+        data,
+        measured,
+        [*_NOTES, found, status_note(data), missing_note(measured, " (hatched)")],
+    )
     return figure

@@ -1,8 +1,9 @@
-"""Pictures of a flow: grains in their sheared cell, coloured by speed or pressure, and the forces between them.
+"""Pictures of a flow: grains in their sheared cell, coloured by speed or pressure, and the forces
+between them.
 
-Lines join the centres of grains that push each other. Their width is proportional to the force, within limits. A line
-is black if most of its force acts within clusters of three or more grains. It is red, and much lighter in a grey print,
-if the two grains collide without touching others.
+Lines join the centres of grains that push each other. Their width is proportional to the force,
+within limits. A line is black if most of its force acts within clusters of three or more grains. It
+is red, and much lighter in a grey print, if the two grains collide without touching others.
 """
 
 from collections.abc import Iterable, Sequence
@@ -23,7 +24,14 @@ from jaxgran.analysis.series import series
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.checks import InputError, require_untraced, short_repr
-from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TICK_SIZE, empty_figure, image_segments, scientific
+from jaxgran.plotting.drawing import (
+    LABEL_SIZE,
+    SMALL_SIZE,
+    TICK_SIZE,
+    empty_figure,
+    image_segments,
+    scientific,
+)
 from jaxgran.plotting.encoding import (
     BINARY_COLOUR,
     CLUSTER_COLOUR,
@@ -41,7 +49,9 @@ COLOUR_LABELS: dict[str, str] = {
     "speed": r"peculiar speed $|c|$  ($\sigma\dot\gamma$)",
     "pressure": r"contact pressure of a grain  ($m\dot\gamma^2$)",
 }
-COLOURS = {name: LinearSegmentedColormap.from_list(name, ramp) for name, ramp in GRAIN_RAMPS.items()}
+COLOURS = {
+    name: LinearSegmentedColormap.from_list(name, ramp) for name, ramp in GRAIN_RAMPS.items()
+}
 _CLUSTER: dict[str, Any] = {"color": CLUSTER_COLOUR, "capstyle": "round"}
 _BINARY: dict[str, Any] = {"color": BINARY_COLOUR, "capstyle": "round"}
 _LEGEND: dict[str, Any] = {
@@ -73,7 +83,8 @@ class Scene(NamedTuple):
 
 
 class Scale(NamedTuple):
-    """The values of the deepest colour and the widest line of a picture; larger values look the same.
+    """The values of the deepest colour and the widest line of a picture; larger values look the
+    same.
 
     ``colour`` is a speed in σγ̇ or a pressure in mγ̇², ``force`` a force in mσγ̇².
     """
@@ -86,10 +97,12 @@ def flow_figure(seen: Snapshot, colour: Colour = "speed", strain: float | None =
     """A picture of a flow: its grains and the forces between them.
 
     Args:
-      seen: one snapshot, with the forces of one time step; or a series with a (times,) axis. The forces of a series are
-        averaged, and the grains of its middle snapshot are drawn. Few grains collide in a short time step. A series
-        with a snapshot of each of a hundred steps (``snapshot_series``) shows all collisions of that time.
-      colour: "speed", |c| without the shear, or "pressure", of the contacts of each grain over its own area.
+      seen: one snapshot, with the forces of one time step; or a series with a (times,) axis. The
+        forces of a series are averaged, and the grains of its middle snapshot are drawn. Few grains
+        collide in a short time step. A series with a snapshot of each of a hundred steps
+        (``snapshot_series``) shows all collisions of that time.
+      colour: "speed", |c| without the shear, or "pressure", of the contacts of each grain over its
+        own area.
       strain: strain since the start for the title, or None to leave it out.
 
     Raises:
@@ -112,22 +125,28 @@ def scene_of(seen: Snapshot) -> Scene:
     """The scene of a snapshot, or of a series of snapshots."""
     if not isinstance(seen, Snapshot) or np.ndim(seen.state.side) > 1:
         raise InputError(
-            f"seen must be a Snapshot of one flow or a series of them, not {short_repr(type(seen).__name__)}."
+            "seen must be a Snapshot of one flow or a series of them, not "
+            f"{short_repr(type(seen).__name__)}."
         )
     require_untraced("flow_figure", "draw what the transformed function returns", seen)
     frames = series(seen)
     state, times = frames.state, len(frames.state.side)
     middle = times // 2
-    if not (np.isfinite(state.positions[middle]).all() and np.isfinite(state.velocities[middle]).all()):
+    if not (
+        np.isfinite(state.positions[middle]).all() and np.isfinite(state.velocities[middle]).all()
+    ):
         raise InputError("seen must be a flow of finite positions and velocities.")
     rate = frames.shear_rate[middle].item()
     if not rate > 0:
-        raise InputError("seen must be of a sheared flow: its shear rate is the unit of the picture.")
+        raise InputError(
+            "seen must be of a sheared flow: its shear rate is the unit of the picture."
+        )
     step, instant = frames.timestep[middle].item() * rate, instant_of(seen)
     radii = instant.radii
     return Scene(
         instant=instant,
-        pressure=np.bincount(instant.pairs.ravel(), np.repeat(instant.force, 2), len(radii)) / (2 * np.pi * radii),
+        pressure=np.bincount(instant.pairs.ravel(), np.repeat(instant.force, 2), len(radii))
+        / (2 * np.pi * radii),
         restitution=frames.restitution[middle].item(),
         packing_fraction=float(np.sum(np.pi * radii**2) / instant.side**2),
         timestep=step,
@@ -156,7 +175,9 @@ class Artists(NamedTuple):
     title: Text
 
 
-def draw_picture(axes: Axes, scene: Scene, colour: Colour, scale: Scale, strain: float | None = None) -> Artists:
+def draw_picture(
+    axes: Axes, scene: Scene, colour: Colour, scale: Scale, strain: float | None = None
+) -> Artists:
     """Draw a scene with its title, colour bar and legend."""
     artists = draw_scene(axes, scene, colour, scale)
     artists.title.set_text(title_of(scene, strain))
@@ -179,7 +200,9 @@ def draw_scene(axes: Axes, scene: Scene, colour: Colour, scale: Scale) -> Artist
     low, high = -0.6 * side, 0.505 * side
     axes.set(xlim=(-half_width, half_width), ylim=(low, high), aspect="equal")
     axes.set_axis_off()
-    (scale_bar,) = axes.plot([0, length], [0, 0], color="black", linewidth=1.6, solid_capstyle="butt")
+    (scale_bar,) = axes.plot(
+        [0, length], [0, 0], color="black", linewidth=1.6, solid_capstyle="butt"
+    )
     artists = Artists(
         grains=EllipseCollection(
             (),
@@ -196,10 +219,22 @@ def draw_scene(axes: Axes, scene: Scene, colour: Colour, scale: Scale) -> Artist
         ),
         clusters=LineCollection([], zorder=2, **_CLUSTER),
         binaries=LineCollection([], zorder=3, **_BINARY),
-        cell=Polygon(np.zeros((4, 2)), closed=True, facecolor="none", edgecolor="#404040", linewidth=0.9, zorder=4),
+        cell=Polygon(
+            np.zeros((4, 2)),
+            closed=True,
+            facecolor="none",
+            edgecolor="#404040",
+            linewidth=0.9,
+            zorder=4,
+        ),
         scale_bar=scale_bar,
         scale_label=axes.annotate(
-            rf"{length} $\sigma$", (0, 0), (4, 0), textcoords="offset points", va="center", fontsize=TICK_SIZE
+            rf"{length} $\sigma$",
+            (0, 0),
+            (4, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=TICK_SIZE,
         ),
         title=axes.set_title("", fontsize=LABEL_SIZE),
     )
@@ -218,7 +253,9 @@ def show_scene(artists: Artists, scene: Scene, colour: Colour, scale: Scale) -> 
     artists.cell.set_xy(corners)
     which, places = _images(instant)
     diameters = 2 * instant.radii[which]
-    artists.grains.set(widths=diameters, heights=diameters, angles=np.zeros(which.size), offsets=places)
+    artists.grains.set(
+        widths=diameters, heights=diameters, angles=np.zeros(which.size), offsets=places
+    )
     artists.grains.set_array(getattr(scene, colour)[which])
     segments, pairs = _segments(instant)
     widths = np.clip(WIDEST_LINE * instant.force / scale.force, THINNEST_LINE, WIDEST_LINE)
@@ -235,19 +272,25 @@ def show_scene(artists: Artists, scene: Scene, colour: Colour, scale: Scale) -> 
 
 
 def _segments(instant: Instant) -> tuple[np.ndarray, np.ndarray]:
-    """Lines and images of lines that reach into the cell: their ends (images, 2, 2) in σ, and indices of the pairs."""
+    """Lines and images of lines that reach into the cell: their ends (images, 2, 2) in σ, and
+    indices of the pairs.
+    """
     i, j = instant.positions[instant.pairs.T]
     branches = minimum_image(i - j, instant.side, instant.tilt)
     shifts = instant.side * np.array([(a + instant.tilt * b, b) for a, b in _LATTICE])
     ends = image_segments(j, branches, shifts)
     along, up = ends[..., 0] - instant.tilt * ends[..., 1], ends[..., 1]
     reach = (0.5 + _LINE_MARGIN) * instant.side
-    inside = np.all([(x.min(axis=-1) < reach) & (x.max(axis=-1) > -reach) for x in (along, up)], axis=0)
+    inside = np.all(
+        [(x.min(axis=-1) < reach) & (x.max(axis=-1) > -reach) for x in (along, up)], axis=0
+    )
     return ends[inside], np.tile(np.arange(len(instant.force)), len(shifts))[inside]
 
 
 def _images(instant: Instant) -> tuple[np.ndarray, np.ndarray]:
-    """Grains and images that reach into the cell: indices of the grains (images,) and positions (images, 2) in σ."""
+    """Grains and images that reach into the cell: indices of the grains (images,) and positions
+    (images, 2) in σ.
+    """
     side, tilt, radii = instant.side, instant.tilt, instant.radii[:, None]
     places = instant.positions[:, None] + side * np.array([(a + tilt * b, b) for a, b in _LATTICE])
     y = places[..., 1]
@@ -265,7 +308,9 @@ def force_key(scale: Scale) -> Sequence[Line2D]:
         (_BINARY["color"], 2.5, "binary collisions"),
         ("#c4c4c4", WIDEST_LINE, f"widest: {largest}"),
     )
-    return [Line2D([], [], color=colour, linewidth=width, label=label) for colour, width, label in keys]
+    return [
+        Line2D([], [], color=colour, linewidth=width, label=label) for colour, width, label in keys
+    ]
 
 
 def title_of(scene: Scene, strain: float | None = None) -> str:
@@ -279,6 +324,10 @@ def title_of(scene: Scene, strain: float | None = None) -> str:
     if strain is not None:
         parts.append(f"strain {strain:.3f}")
     every_step = abs(scene.window / (scene.times * scene.timestep) - 1) < 1e-3
-    window = f"{scene.times} time steps, a strain of {scene.window:.3g}" if every_step else f"{scene.times} snapshots"
+    window = (
+        f"{scene.times} time steps, a strain of {scene.window:.3g}"
+        if every_step
+        else f"{scene.times} snapshots"
+    )
     forces = "forces of one time step" if scene.times == 1 else f"mean forces over {window}"
     return f"{', '.join(parts)}\n{forces}"

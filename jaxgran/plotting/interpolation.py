@@ -1,8 +1,10 @@
-"""Fields between the points of a map: bilinear interpolation, and its error as the map itself shows it.
+"""Fields between the points of a map: bilinear interpolation, and its error as the map itself shows
+it.
 
-A linear interpolation over an interval h is wrong by |f″| h² t (1 − t)/2 at a share t of it. The second derivative
-follows from how well a point that is left out is interpolated from its two neighbours along an axis. The errors of both
-axes are added. Noise of the points is part of what is measured so.
+A linear interpolation over an interval h is wrong by |f″| h² t (1 − t)/2 at a share t of it. The
+second derivative follows from how well a point that is left out is interpolated from its two
+neighbours along an axis. The errors of both axes are added. Noise of the points is part of what is
+measured so.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ def refined_axes(data: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
 
 
 def interpolated(field: np.ndarray) -> np.ma.MaskedArray:
-    """Return a field interpolated bilinearly to a finer grid, masked where a missing point would contribute."""
+    """Return a field interpolated bilinearly to a finer grid, masked where a missing point would
+    contribute.
+    """
     rows, columns = (_refinement(count) for count in field.shape)
     missing = ~np.isfinite(field)
     values = rows @ np.where(missing, 0.0, field) @ columns.T
@@ -31,19 +35,24 @@ def interpolated(field: np.ndarray) -> np.ma.MaskedArray:
 
 
 def interpolation_error(data: xr.Dataset, field: np.ndarray) -> np.ndarray:
-    """Return the estimated error of the interpolated field of a map at its points; zero at the points of the map.
+    """Return the estimated error of the interpolated field of a map at its points; zero at the
+    points of the map.
 
-    Along an axis of two points, and beside missing ones, no error can be estimated, and none is added.
+    Along an axis of two points, and beside missing ones, no error can be estimated, and none is
+    added.
     """
     x, y = _axes(data)
     rows, columns = (_refinement(count) for count in field.shape)
     return _error_along(y, field) @ columns.T + rows @ _error_along(x, field.T).T
 
 
-def left_out_note(data: xr.Dataset, fields: Iterable[np.ndarray], of: str, counted: np.ndarray | bool = True) -> str:
+def left_out_note(
+    data: xr.Dataset, fields: Iterable[np.ndarray], of: str, counted: np.ndarray | bool = True
+) -> str:
     """Return a line about the errors of points that are left out and interpolated.
 
-    The fields are logarithms or shares of what is named by `of`. Only points that are counted are left out.
+    The fields are logarithms or shares of what is named by `of`. Only points that are counted are
+    left out.
     """
     x, y = _axes(data)
     errors = []
@@ -54,7 +63,9 @@ def left_out_note(data: xr.Dataset, fields: Iterable[np.ndarray], of: str, count
     known = known[np.isfinite(known)]
     if len(known) < _FEWEST:
         return "Linear interpolation between points, too few to estimate its error"
-    median, large = (f"{float(f'{100 * value:.2g}'):g} %" for value in np.quantile(known, (0.5, 0.9)))
+    median, large = (
+        f"{float(f'{100 * value:.2g}'):g} %" for value in np.quantile(known, (0.5, 0.9))
+    )
     return f"Leave-one-out interpolation error of {of}: median {median}, 90th percentile {large}"
 
 
@@ -69,7 +80,9 @@ def _refinement(count: int) -> np.ndarray:
 
 
 def _left_out(axis: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """Return the error (count − 2, others) of each inner point of the first axis, interpolated from its neighbours."""
+    """Return the error (count − 2, others) of each inner point of the first axis, interpolated from
+    its neighbours.
+    """
     share = ((axis[1:-1] - axis[:-2]) / (axis[2:] - axis[:-2]))[:, None]
     return (1.0 - share) * field[:-2] + share * field[2:] - field[1:-1]
 
@@ -79,9 +92,13 @@ def _error_along(axis: np.ndarray, field: np.ndarray) -> np.ndarray:
     steps = np.diff(axis)
     if len(steps) < 2:
         return np.zeros((_SUBDIVISIONS * len(steps) + 1, field.shape[1]))
-    curvature = np.abs(_left_out(axis, field)) / (steps[:-1] * steps[1:])[:, None]  # half the second derivative
+    curvature = (
+        np.abs(_left_out(axis, field)) / (steps[:-1] * steps[1:])[:, None]
+    )  # half the second derivative
     curvature = np.nan_to_num(curvature)[[0, *range(len(steps) - 1), -1]]
-    largest = np.maximum(curvature[:-1], curvature[1:]) * steps[:, None] ** 2  # of the two ends of each interval
+    largest = (
+        np.maximum(curvature[:-1], curvature[1:]) * steps[:, None] ** 2
+    )  # of the two ends of each interval
     position = np.linspace(0.0, len(steps), _SUBDIVISIONS * len(steps) + 1)
     interval = np.minimum(position.astype(int), len(steps) - 1)
     share = (position - interval)[:, None]

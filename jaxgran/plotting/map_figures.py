@@ -50,18 +50,21 @@ def save_figures(
 
     Each file is written whole or not at all. The same map gives the same bytes.
 
-    =======================  ==========================  ===============================================================
+    =======================  ==========================  ===========================================
     file                     function                    written if the map has
-    =======================  ==========================  ===============================================================
+    =======================  ==========================  ===========================================
     `{stem}_curves.png`      `ratio_curves`              always
-    `{stem}_contours.png`    `ratio_contours`            at least two restitutions, two packing fractions, and one time
+    `{stem}_contours.png`    `ratio_contours`            at least two restitutions, two packing
+                                                         fractions, and one time
                                                          step for all points
     `{stem}_timestep.png`    `ratio_against_timestep`    at least two time steps
     `{stem}_size.png`        `averages_against_grains`   at least two numbers of grains
-    `{stem}_theory.png`      `theory_errors`             a plane as for the contours, and the predictions of the theory
-    `{stem}_factors.png`     `enskog_factors`            a plane, and the factors of the error of the theory
+    `{stem}_theory.png`      `theory_errors`             a plane as for the contours, and the
+                                                         predictions of the theory
+    `{stem}_factors.png`     `enskog_factors`            a plane, and the factors of the error of
+                                                         the theory
     `{stem}_clusters.png`    `cluster_shares`            the shares of the clusters
-    =======================  ==========================  ===============================================================
+    =======================  ==========================  ===========================================
 
     Args:
       data: as in :func:`ratio_curves` or :func:`ratio_against_timestep`.
@@ -72,7 +75,8 @@ def save_figures(
       overwrite: whether files that are there are replaced; otherwise they are kept.
 
     Raises:
-      InputError: (a ValueError) the data are not a map, a choice is not one of these, or no files can be written there.
+      InputError: (a ValueError) the data are not a map, a choice is not one of these, or no files
+        can be written there.
     """
     data = require_map(data, *RATIO)
     require_file(format, dpi)
@@ -93,8 +97,14 @@ def save_figures(
 
 
 def remove_pictures(path: Path, but: Iterable[Path] = ()) -> None:
-    """Remove the pictures of a map that was beside a dataset before: all but some, in whatever format."""
-    names = {path.with_name(f"{path.stem}_{name}.{end}") for name in FIGURES for end in get_args(FileFormat)}
+    """Remove the pictures of a map that was beside a dataset before: all but some, in whatever
+    format.
+    """
+    names = {
+        path.with_name(f"{path.stem}_{name}.{end}")
+        for name in FIGURES
+        for end in get_args(FileFormat)
+    }
     for file in names - {*but}:
         if file.is_file():
             file.unlink()

@@ -1,4 +1,6 @@
-"""The effect of the number of grains: averages of a map against N, relative to those at its largest N."""
+"""The effect of the number of grains: averages of a map against N, relative to those at its largest
+N.
+"""
 
 from __future__ import annotations
 
@@ -40,19 +42,22 @@ _QUANTITIES = {
 
 
 def averages_against_grains(data: MapData) -> Figure:
-    """Return pressure, shear stress, granular temperature and force ratio against the number of grains.
+    """Return pressure, shear stress, granular temperature and force ratio against the number of
+    grains.
 
-    Each average is divided by its value at the largest number of grains N. Every restitution and packing fraction has a
-    curve. Up to eight curves share the panels. With more, each packing fraction has a row of panels: at most six of
-    these, and eight restitutions, evenly chosen.
+    Each average is divided by its value at the largest number of grains N. Every restitution and
+    packing fraction has a curve. Up to eight curves share the panels. With more, each packing
+    fraction has a row of panels: at most six of these, and eight restitutions, evenly chosen.
 
     Args:
-      data: a map with a dimension `grains`, with `force_ratio` and any of `pressure`, `shear_stress` and
-        `granular_temperature`, their `_stderr`, and `status`. The shortest of several time steps is drawn.
+      data: a map with a dimension `grains`, with `force_ratio` and any of `pressure`,
+        `shear_stress` and `granular_temperature`, their `_stderr`, and `status`. The shortest of
+        several time steps is drawn.
 
     Returns:
-      Error bars are one standard error of the quotient, from those of both values; the last quotient is one, without an
-      error. A point whose status is not `ok` is an open symbol in a ring.
+      Error bars are one standard error of the quotient, from those of both values; the last
+      quotient is one, without an error. A point whose status is not `ok` is an open symbol in a
+      ring.
 
     Raises:
       InputError: (a ValueError) fewer than two numbers of grains.
@@ -60,7 +65,9 @@ def averages_against_grains(data: MapData) -> Figure:
     data = require_map(data, *RATIO)
     sizes = data.sizes.get("grains", 1)
     if sizes < 2:
-        raise InputError(f"this figure needs at least two numbers of grains, and this map has {sizes}.")
+        raise InputError(
+            f"this figure needs at least two numbers of grains, and this map has {sizes}."
+        )
     data, left_out = _thinned(finest(ordered(data, *_QUANTITIES), "timestep"))
     names = [name for name in _QUANTITIES if name in data and f"{name}_stderr" in data]
     panels, title = point_panels(data)
@@ -69,7 +76,9 @@ def averages_against_grains(data: MapData) -> Figure:
     handles: list[Line2D] = []
     for row, (words, curves) in zip(grid, panels, strict=True):
         styles = curve_styles(len(curves))
-        handles = [curve_key(style, label) for (label, _), style in zip(curves, styles, strict=True)]
+        handles = [
+            curve_key(style, label) for (label, _), style in zip(curves, styles, strict=True)
+        ]
         for axes, name in zip(row, names, strict=True):
             axes.axhline(1.0, color="0.6", linewidth=0.8, zorder=0)
             for (_, curve), style in zip(curves, styles, strict=True):
@@ -92,14 +101,19 @@ def _thinned(data: xr.Dataset) -> tuple[xr.Dataset, str]:
     words = []
     for name, most in (("restitution", MOST_TOGETHER), ("packing_fraction", _MOST_ROWS)):
         count = data.sizes[name]
-        if data.sizes["restitution"] * data.sizes["packing_fraction"] > MOST_TOGETHER and count > most:
+        if (
+            data.sizes["restitution"] * data.sizes["packing_fraction"] > MOST_TOGETHER
+            and count > most
+        ):
             data = data.isel({name: np.linspace(0, count - 1, most).round().astype(int)})
             words.append(f"{most} of {count} {name.replace('_', ' ')}s")
     return data, ", ".join(words)
 
 
 def _draw_curve(axes: Axes, curve: xr.Dataset, name: str, style: dict) -> None:
-    """Draw one average over its value at the largest number of grains, with error bars and suspect points."""
+    """Draw one average over its value at the largest number of grains, with error bars and suspect
+    points.
+    """
     value, stderr = curve[name].values, curve[f"{name}_stderr"].values
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio, relative = value / value[-1], stderr / abs(value)
@@ -109,7 +123,9 @@ def _draw_curve(axes: Axes, curve: xr.Dataset, name: str, style: dict) -> None:
 
 
 def _set_size_scale(axes: Axes, grains: np.ndarray) -> None:
-    """Make the axis of the number of grains logarithmic, with the sizes of the map as its numbers."""
+    """Make the axis of the number of grains logarithmic, with the sizes of the map as its
+    numbers.
+    """
     axes.set_xscale("log")
     margin = (grains[-1] / grains[0]) ** 0.08
     axes.set_xlim(grains[0] / margin, grains[-1] * margin)

@@ -1,9 +1,10 @@
 """Kinetic theory with a measured correlation length and measured pairs at contact.
 
-Enskog's theory takes the velocities of colliding grains to be independent and the pairs at contact to be those of a
-fluid in equilibrium. In dissipative flow they approach more slowly, so less energy is lost at the same stress, and in
-dense flow there are more pairs. Two laws of restitution and packing fraction, fitted to a map, say by how much; the
-balance of the moments then gives temperature and stresses. Units: ``steady_shear``.
+Enskog's theory takes the velocities of colliding grains to be independent and the pairs at contact
+to be those of a fluid in equilibrium. In dissipative flow they approach more slowly, so less energy
+is lost at the same stress, and in dense flow there are more pairs. Two laws of restitution and
+packing fraction, fitted to a map, say by how much; the balance of the moments then gives
+temperature and stresses. Units: ``steady_shear``.
 """
 
 from dataclasses import dataclass, field
@@ -25,24 +26,29 @@ Numbers = Array | np.ndarray
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class CorrelationLaws:
-    """Coefficients of the laws of the correlation length and of the pairs at contact, and where they come from.
+    """Coefficients of the laws of the correlation length and of the pairs at contact, and where
+    they come from.
 
-    =======================  =====  ==========================================================================
+    =======================  =====  ================================================================
     field                    shape  meaning; all are dimensionless
-    =======================  =====  ==========================================================================
-    length                   (3,)   a, b, k of L = 1 + a (1 − α)² y + b (1 − α) y^k, y = 1/(1 − ν/ν_J), in mean
+    =======================  =====  ================================================================
+    length                   (3,)   a, b, k of L = 1 + a (1 − α)² y + b (1 − α) y^k, y = 1/(1 −
+                                    ν/ν_J), in mean
                                     diameters
     length_stderr            (3,)   their standard errors
-    pairs                    (3,)   c, e, m of R = (1 + c (1 − α)⁵) (1 + e (1 − α)^(1/3) y^m), pairs at contact
+    pairs                    (3,)   c, e, m of R = (1 + c (1 − α)⁵) (1 + e (1 − α)^(1/3) y^m), pairs
+                                    at contact
                                     that carry the stress over those of equilibrium
     pairs_stderr             (3,)   their standard errors
     jamming_fraction         ()     ν_J
-    scatter                  (3,)   rms of the errors of ln T, ln p and ln τ at flows that were not fitted
-    restitution_range        (2,)   smallest and largest α at which the scatter holds; nearly elastic dense flow is more
+    scatter                  (3,)   rms of the errors of ln T, ln p and ln τ at flows that were not
+                                    fitted
+    restitution_range        (2,)   smallest and largest α at which the scatter holds; nearly
+                                    elastic dense flow is more
                                     viscous than in Enskog's theory
     packing_fraction_range   (2,)   smallest and largest ν at which the scatter holds
     fitted_to, judged_on            maps, in words; static
-    =======================  =====  ==========================================================================
+    =======================  =====  ================================================================
     """
 
     length: Float[Numbers, " 3"]
@@ -75,22 +81,27 @@ MEASURED_LAWS = CorrelationLaws(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class CorrectedShear:
-    """Prediction of :func:`corrected_shear`; scalars, with a leading ``(replicas,)`` under ``vmap``.
+    """Prediction of :func:`corrected_shear`; scalars, with a leading ``(replicas,)`` under
+    ``vmap``.
 
-    ====================  =======  ===========================================================================
+    ====================  =======  =================================================================
     field                 unit     meaning
-    ====================  =======  ===========================================================================
+    ====================  =======  =================================================================
     granular_temperature  m(σ/t)²  T relative to the flow nearby, which a map holds as
-                                   ``local_granular_temperature``; the energy of long waves is not in it
+                                   ``local_granular_temperature``; the energy of long waves is not
+                                   in it
     pressure              m/t²     half the trace of the stress, kinetic and collisional
     shear_stress          m/t²     positive, kinetic and collisional
-    dissipation_rate      m/t³     energy lost per unit area and time, Enskog's times R/L; equals shear_stress ×
+    dissipation_rate      m/t³     energy lost per unit area and time, Enskog's times R/L; equals
+                                   shear_stress ×
                                    shear_rate
-    …_stderr              as …     the first three times the scatter of the laws: standard errors of a prediction
+    …_stderr              as …     the first three times the scatter of the laws: standard errors of
+                                   a prediction
     correlation_length    σ        L
     pair_factor           –        R
-    extrapolated          –        true outside the ranges of the laws, where the errors are unreliable
-    ====================  =======  ===========================================================================
+    extrapolated          –        true outside the ranges of the laws, where the errors are
+                                   unreliable
+    ====================  =======  =================================================================
     """
 
     granular_temperature: Float[Array, "*replicas"]
@@ -114,7 +125,8 @@ def corrected_shear(
     size_classes: int = 4,
     laws: CorrelationLaws = MEASURED_LAWS,
 ) -> CorrectedShear:
-    """Steady shear by the theory of ``gaussian_moments``, corrected by a correlation length and by pairs at contact.
+    """Steady shear by the theory of ``gaussian_moments``, corrected by a correlation length and by
+    pairs at contact.
 
     ================  ====  =======================================================
     name              unit  meaning
@@ -130,20 +142,22 @@ def corrected_shear(
     returns                 CorrectedShear; not finite at α = 1 and from ν_J on
     ================  ====  =======================================================
 
-    Every contact value is multiplied by the pair factor R, and collisions lose 1/L of the energy of Enskog's theory:
-    Γ = R Γ_E/L and p_c = R p_E at the same temperature tensor, where p_c is the collisional pressure. The balance of
-    the moments is then solved as without them, so that τγ̇ = Γ. No coefficient is adjusted to T, p or τ.
+    Every contact value is multiplied by the pair factor R, and collisions lose 1/L of the energy of
+    Enskog's theory: Γ = R Γ_E/L and p_c = R p_E at the same temperature tensor, where p_c is the
+    collisional pressure. The balance of the moments is then solved as without them, so that τγ̇ =
+    Γ. No coefficient is adjusted to T, p or τ.
 
-    Source: a correlation length that divides the dissipation rate is that of extended kinetic theory, for instance of
-    D. Vescovi, D. Berzi, P. Richard and N. Brodu, Phys. Fluids 26, 053305 (2014). Both laws are fits of this project
-    (``python -m benchmarks dissipation``).
+    Source: a correlation length that divides the dissipation rate is that of extended kinetic
+      theory, for instance of D. Vescovi, D. Berzi, P. Richard and N. Brodu, Phys. Fluids 26, 053305
+      (2014). Both laws are fits of this project (``python -m benchmarks dissipation``).
 
     Examples:
       Grains lose less energy than in Enskog's theory, so the flow is hotter.
 
       >>> from jaxgran.theory.gaussian_moments import gaussian_moments
       >>> corrected, enskog = corrected_shear(0.5, 0.6), gaussian_moments(0.5, 0.6)
-      >>> bool(corrected.granular_temperature > enskog.granular_temperature), round(float(enskog.pressure), 2)
+      >>> hotter = bool(corrected.granular_temperature > enskog.granular_temperature)
+      >>> hotter, round(float(enskog.pressure), 2)
       (True, 1.2)
     """
     alpha, nu, rate, width = as_floats(restitution, packing_fraction, shear_rate, polydispersity)
@@ -151,7 +165,9 @@ def corrected_shear(
     length, pairs = correlation_length(laws, alpha, nu), pair_factor(laws, alpha, nu)
     mixture = uniform_mixture(nu, width, size_classes)
     mixture = mixture._replace(encounters=pairs * mixture.encounters)
-    found = steady_moments(alpha, rate, mixture, jnp.log(garzo_dufty(alpha, nu).granular_temperature), length)
+    found = steady_moments(
+        alpha, rate, mixture, jnp.log(garzo_dufty(alpha, nu).granular_temperature), length
+    )
     of_temperature, of_pressure, of_shear = laws.scatter
     return CorrectedShear(
         granular_temperature=found.granular_temperature,
@@ -163,17 +179,22 @@ def corrected_shear(
         shear_stress_stderr=found.shear_stress * of_shear,
         correlation_length=length,
         pair_factor=pairs,
-        extrapolated=outside(alpha, laws.restitution_range) | outside(nu, laws.packing_fraction_range),
+        extrapolated=outside(alpha, laws.restitution_range)
+        | outside(nu, laws.packing_fraction_range),
     )
 
 
 def correlation_length(laws: CorrelationLaws, alpha: Numbers, nu: Numbers) -> Array:
     """L = 1 + a (1 − α)² y + b (1 − α) y^k with y = 1/(1 − ν/ν_J), in mean diameters."""
     crowding, loss = 1 / (1 - nu / laws.jamming_fraction), 1 - alpha
-    return 1 + laws.length[0] * loss**2 * crowding + laws.length[1] * loss * crowding ** laws.length[2]
+    return (
+        1 + laws.length[0] * loss**2 * crowding + laws.length[1] * loss * crowding ** laws.length[2]
+    )
 
 
 def pair_factor(laws: CorrelationLaws, alpha: Numbers, nu: Numbers) -> Array:
     """R = (1 + c (1 − α)⁵) (1 + e (1 − α)^(1/3) y^m) with y = 1/(1 − ν/ν_J)."""
     crowding, loss = 1 / (1 - nu / laws.jamming_fraction), 1 - alpha
-    return (1 + laws.pairs[0] * loss**5) * (1 + laws.pairs[1] * jnp.cbrt(loss) * crowding ** laws.pairs[2])
+    return (1 + laws.pairs[0] * loss**5) * (
+        1 + laws.pairs[1] * jnp.cbrt(loss) * crowding ** laws.pairs[2]
+    )

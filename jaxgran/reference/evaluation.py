@@ -1,4 +1,6 @@
-"""Averages of a table at any points in its range: of NumPy where the numbers are known, of JAX where it traces them."""
+"""Averages of a table at any points in its range: of NumPy where the numbers are known, of JAX
+where it traces them.
+"""
 
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
@@ -14,7 +16,9 @@ PLANE = ("restitution", "packing_fraction")
 
 
 class Estimate(NamedTuple):
-    """Logarithms of an average: over the theory's prediction, of the prediction, and half of its 95 % interval."""
+    """Logarithms of an average: over the theory's prediction, of the prediction, and half of its 95
+    % interval.
+    """
 
     over: Any
     theory: Any
@@ -26,7 +30,9 @@ class Estimate(NamedTuple):
         return value, value * xp.sinh(self.half)
 
 
-def estimates(table: Table, where: Any, xp: Any = np, names: Iterable[str] = MEASURED) -> dict[str, Estimate]:
+def estimates(
+    table: Table, where: Any, xp: Any = np, names: Iterable[str] = MEASURED
+) -> dict[str, Estimate]:
     """Averages by name at coordinates in the measured range; that of ``LENGTH`` is over one."""
     logs = table.series(where, xp)
     found = {}
@@ -39,12 +45,15 @@ def estimates(table: Table, where: Any, xp: Any = np, names: Iterable[str] = MEA
     return found
 
 
-def over_range(table: Table, evaluate: Callable[[Any, Any], Any], restitution: Any, packing_fraction: Any) -> Any:
+def over_range(
+    table: Table, evaluate: Callable[[Any, Any], Any], restitution: Any, packing_fraction: Any
+) -> Any:
     """A pytree of averages at restitutions and packing fractions, after both.
 
     Args:
       table: the table whose range is accepted.
-      evaluate: the averages at coordinates in that range, and the module of arrays to calculate them with.
+      evaluate: the averages at coordinates in that range, and the module of arrays to calculate
+        them with.
       restitution: α, a number or an array.
       packing_fraction: ν, a number or an array; the two broadcast.
 
@@ -52,16 +61,22 @@ def over_range(table: Table, evaluate: Callable[[Any, Any], Any], restitution: A
       α, ν and the pytree. NaN where JAX traces a value that is outside the range.
 
     Raises:
-      InputError: a value is outside the range, shapes do not broadcast, or JAX traces a value in single precision.
+      InputError: a value is outside the range, shapes do not broadcast, or JAX traces a value in
+        single precision.
     """
     values, xp = (restitution, packing_fraction), module_of(restitution, packing_fraction)
     if xp is np:
-        values = [_checked(name, value, *table.range(name)) for name, value in zip(PLANE, values, strict=True)]
+        values = [
+            _checked(name, value, *table.range(name))
+            for name, value in zip(PLANE, values, strict=True)
+        ]
     try:
         alpha, nu = xp.broadcast_arrays(*(xp.asarray(x, float) for x in values))
     except ValueError:
         shapes = " and ".join(f"{np.shape(x)}" for x in values)
-        raise InputError(f"restitution and packing_fraction must have shapes that broadcast, not {shapes}.") from None
+        raise InputError(
+            f"restitution and packing_fraction must have shapes that broadcast, not {shapes}."
+        ) from None
     (first, last), (loosest, densest) = (table.range(name) for name in PLANE)
     inside = (first <= alpha) & (alpha <= last) & (loosest <= nu) & (nu <= densest)
     middle = (first + last) / 2, (loosest + densest) / 2
@@ -70,8 +85,14 @@ def over_range(table: Table, evaluate: Callable[[Any, Any], Any], restitution: A
         return alpha, nu, evaluate(where, np)
     import jax
 
-    found = jax.vmap(lambda one: evaluate(one, xp))(where.reshape(-1, 2))  # one by one: ranks are promoted nowhere
-    return alpha, nu, jax.tree.map(lambda x: xp.where(inside, x.reshape(alpha.shape), np.nan), found)
+    found = jax.vmap(lambda one: evaluate(one, xp))(
+        where.reshape(-1, 2)
+    )  # one by one: ranks are promoted nowhere
+    return (
+        alpha,
+        nu,
+        jax.tree.map(lambda x: xp.where(inside, x.reshape(alpha.shape), np.nan), found),
+    )
 
 
 def module_of(*values: Any) -> Any:
@@ -99,5 +120,7 @@ def _checked(name: str, value: Any, low: float, high: float) -> np.ndarray:
     except (TypeError, ValueError):
         numbers = np.array(np.nan)
     if numbers.size == 0 or not np.all((low <= numbers) & (numbers <= high)):
-        raise refused(name, value, f"must be between {low:g} and {high:g}, the range of the reference map")
+        raise refused(
+            name, value, f"must be between {low:g} and {high:g}, the range of the reference map"
+        )
     return numbers

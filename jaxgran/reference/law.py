@@ -1,4 +1,5 @@
-"""The constitutive law of steady simple shear that the reference map measured, for solvers of continuum equations.
+"""The constitutive law of steady simple shear that the reference map measured, for solvers of
+continuum equations.
 
 Nothing is simulated. The averages are those of ``validity``, and so are their errors.
 """
@@ -28,9 +29,12 @@ _INSIDE = (
     "points",
 )  # lines of the head of a table that say what else it holds
 _MEANING = {  # of the numbers of a file
-    "units": "m and sigma are mass and diameter of the mean grain, m = pi/4 sigma^2 times the density of the grain",
-    "shear rate": "1/t; at shear rate s multiply by s^2, the dissipation rate by s^3, and the length by 1",
-    "ci95": "half of the 95 % interval: sampling, interpolation, time step, tolerance and the difference from a large "
+    "units": "m and sigma are mass and diameter of the mean grain, m = pi/4 sigma^2 times the "
+    "density of the grain",
+    "shear rate": "1/t; at shear rate s multiply by s^2, the dissipation rate by s^3, and the "
+    "length by 1",
+    "ci95": "half of the 95 % interval: sampling, interpolation, time step, tolerance and the "
+    "difference from a large "
     "system, for the length sampling and interpolation; errors of neighbouring rows are correlated",
     "interpolation": "of logarithms, in sqrt(1 - restitution) and packing_fraction",
 }
@@ -41,19 +45,24 @@ class Rheology(NamedTuple):
 
     All arrays have the shape to which the arguments of the law broadcast; () for three numbers.
 
-    ================================  =========  =====================================================================
+    ================================  =========  ===================================================
     field                             unit       meaning
-    ================================  =========  =====================================================================
-    pressure                          m/t²       p, half the trace of the stress; proportional to γ̇²
+    ================================  =========  ===================================================
+    pressure                          m/t²       p, half the trace of the stress; proportional to
+                                                 γ̇²
     shear_stress                      m/t²       τ, positive; proportional to γ̇²
-    granular_temperature              m(σ/t)²    T = Σ m c²/(2N), c the peculiar velocity; proportional to γ̇²
-    local_granular_temperature        m(σ/t)²    T relative to the flow nearby, which long waves do not raise;
+    granular_temperature              m(σ/t)²    T = Σ m c²/(2N), c the peculiar velocity;
                                                  proportional to γ̇²
-    dissipation_rate                  m/t³       Γ, energy lost per area and time, equals τγ̇; proportional to γ̇³
-    correlation_length_from_pressure  σ          L′ = (Γ_E/p_E)/(Γ/p), p the contact pressure, E Enskog's value at the
+    local_granular_temperature        m(σ/t)²    T relative to the flow nearby, which long waves do
+                                                 not raise;
+                                                 proportional to γ̇²
+    dissipation_rate                  m/t³       Γ, energy lost per area and time, equals τγ̇;
+                                                 proportional to γ̇³
+    correlation_length_from_pressure  σ          L′ = (Γ_E/p_E)/(Γ/p), p the contact pressure, E
+                                                 Enskog's value at the
                                                  measured local temperature; does not depend on γ̇
     …_ci95                            as …       of each
-    ================================  =========  =====================================================================
+    ================================  =========  ===================================================
     """
 
     pressure: Any
@@ -73,7 +82,8 @@ class Rheology(NamedTuple):
 @register_static
 @dataclass(frozen=True)
 class ConstitutiveLaw:
-    """Stresses, temperatures, dissipation and correlation length of a flow as smooth functions; see `constitutive_law`.
+    """Stresses, temperatures, dissipation and correlation length of a flow as smooth functions; see
+    `constitutive_law`.
 
     A pytree without leaves, which can be passed to transformed functions or closed over.
 
@@ -105,12 +115,13 @@ class ConstitutiveLaw:
           shear_rate: γ̇ > 0 in 1/t, a number or an array; the three broadcast.
 
         Returns:
-          A ``Rheology``, in arrays of NumPy where all numbers are known. ``jax.jit``, ``jax.vmap`` and derivatives
-          apply, in double precision only; NaN where JAX traces a value outside the measured range.
+          A ``Rheology``, in arrays of NumPy where all numbers are known. ``jax.jit``, ``jax.vmap``
+          and derivatives apply, in double precision only; NaN where JAX traces a value outside the
+          measured range.
 
         Raises:
-          InputError: (a ValueError) a value is outside the measured range, which the message names; γ̇ is not positive;
-            or JAX traces a value without ``jax_enable_x64``.
+          InputError: (a ValueError) a value is outside the measured range, which the message names;
+            γ̇ is not positive; or JAX traces a value without ``jax_enable_x64``.
         """
         shear_rate = as_array(shear_rate)
         require("shear_rate", shear_rate, lambda x: x > 0, "a positive number")
@@ -124,14 +135,22 @@ class ConstitutiveLaw:
         return Rheology(**scaled)
 
     def _evaluated(self, where: Any, xp: Any) -> dict[str, tuple[Any, Any]]:
-        """Every average at unit shear rate and the half-width of its interval, at coordinates in the range."""
-        return {name: one.value_and_ci95(xp) for name, one in estimates(self.table, where, xp, _UNITS).items()}
+        """Every average at unit shear rate and the half-width of its interval, at coordinates in
+        the range.
+        """
+        return {
+            name: one.value_and_ci95(xp)
+            for name, one in estimates(self.table, where, xp, _UNITS).items()
+        }
 
-    def to_csv(self, path: str | Path, restitution: Any = None, packing_fraction: Any = None) -> None:
+    def to_csv(
+        self, path: str | Path, restitution: Any = None, packing_fraction: Any = None
+    ) -> None:
         """Write the law as a table, for programs in other languages.
 
-        Lines that begin with ``#`` say what the numbers are: map, N, time step, version, range, units and the meaning
-        of the errors. Then come the names of the columns and a row for every pair of α and ν.
+        Lines that begin with ``#`` say what the numbers are: map, N, time step, version, range,
+        units and the meaning of the errors. Then come the names of the columns and a row for every
+        pair of α and ν.
 
         Args:
           path: file to write; an existing one is replaced.
@@ -142,15 +161,23 @@ class ConstitutiveLaw:
           InputError: (a ValueError) a value is outside the measured range.
         """
         low, high = self.packing_fraction_range
-        alphas = np.unique(self.table.columns["restitution"]) if restitution is None else np.ravel(restitution)
+        alphas = (
+            np.unique(self.table.columns["restitution"])
+            if restitution is None
+            else np.ravel(restitution)
+        )
         every = np.arange(np.ceil(low / _STEP), high / _STEP + 0.5) * _STEP
         nus = np.round(every, 2) if packing_fraction is None else np.ravel(packing_fraction)
         plane = [x.ravel() for x in np.meshgrid(alphas, nus, indexing="ij")]
         columns = dict(zip(PLANE, plane, strict=True)) | self(*plane)._asdict()
-        columns = {name: columns[name] for name in (*PLANE, *(x + end for x in _UNITS for end in ("", "_ci95")))}
+        columns = {
+            name: columns[name]
+            for name in (*PLANE, *(x + end for x in _UNITS for end in ("", "_ci95")))
+        }
         made_with = {k: v for k, v in self.table.head.items() if not k.startswith(_INSIDE)}
         head = {
-            "contents": "steady simple shear of rigid, frictionless discs as measured, constitutive law of jaxgran",
+            "contents": "steady simple shear of rigid, frictionless discs as measured, "
+            "constitutive law of jaxgran",
             "version": jaxgran.__version__,
             **{f"{name} range": "{:g} to {:g}".format(*self.table.range(name)) for name in PLANE},
             **made_with,
@@ -162,11 +189,13 @@ class ConstitutiveLaw:
 
 
 def constitutive_law() -> ConstitutiveLaw:
-    """The constitutive law of the reference map: p, τ, T, Γ and L′ as functions of α and ν with their errors.
+    """The constitutive law of the reference map: p, τ, T, Γ and L′ as functions of α and ν with
+    their errors.
 
-    Bagnold's scaling holds exactly, as grains are rigid: γ̇ scales stresses and temperatures by γ̇², Γ by γ̇³. Averages
-    are surfaces over the series of a theory, so that all derivatives exist. Errors of neighbouring points are
-    correlated. At given p and γ̇, or at given τ/p, ν follows by Newton's method.
+    Bagnold's scaling holds exactly, as grains are rigid: γ̇ scales stresses and temperatures by
+    γ̇², Γ by γ̇³. Averages are surfaces over the series of a theory, so that all derivatives exist.
+    Errors of neighbouring points are correlated. At given p and γ̇, or at given τ/p, ν follows by
+    Newton's method.
 
     Examples:
       >>> law = constitutive_law()

@@ -1,10 +1,12 @@
-"""Smooth surfaces through measured points of the plane of α and ν, with their standard errors: Gaussian processes.
+"""Smooth surfaces through measured points of the plane of α and ν, with their standard errors:
+Gaussian processes.
 
-The coordinates are √(1 − α) and −ln(0.86 − ν), in which logarithms of averages over those of a theory are smooth. A
-surface is the mean of a Gaussian process that is given the points with their standard errors. Its prior is a plane plus
-a Matérn 5/2 function. Amplitude, lengths and a factor of the standard errors maximise the likelihood; where the points
-left out scatter more than they should, all standard errors are larger by the ratio. C. E. Rasmussen and C. K. I.
-Williams, *Gaussian Processes for Machine Learning* (2006).
+The coordinates are √(1 − α) and −ln(0.86 − ν), in which logarithms of averages over those of a
+theory are smooth. A surface is the mean of a Gaussian process that is given the points with their
+standard errors. Its prior is a plane plus a Matérn 5/2 function. Amplitude, lengths and a factor of
+the standard errors maximise the likelihood; where the points left out scatter more than they
+should, all standard errors are larger by the ratio. C. E. Rasmussen and C. K. I. Williams,
+*Gaussian Processes for Machine Learning* (2006).
 
 All functions take the module of arrays, ``numpy`` or ``jax.numpy``, as ``xp``.
 """
@@ -32,7 +34,9 @@ def packing_fraction(where: Any, xp: Any = np) -> Any:
 
 @dataclass(frozen=True)
 class Shape:
-    """What is fitted of a surface: amplitude, a length along each coordinate, factors of standard errors."""
+    """What is fitted of a surface: amplitude, a length along each coordinate, factors of standard
+    errors.
+    """
 
     amplitude: float
     lengths: tuple[float, float]
@@ -62,11 +66,15 @@ class Surface:
     @cached_property
     def _covariance(self) -> np.ndarray:
         """Covariance of the values at the points."""
-        return self.shape.covariance(self.points, self.points) + np.diag((self.shape.noise * self.stderrs) ** 2)
+        return self.shape.covariance(self.points, self.points) + np.diag(
+            (self.shape.noise * self.stderrs) ** 2
+        )
 
     @cached_property
     def _whitening(self) -> np.ndarray:
-        """The inverse of the lower Cholesky factor of the covariance: the inverse itself would lose small variances."""
+        """The inverse of the lower Cholesky factor of the covariance: the inverse itself would lose
+        small variances.
+        """
         return np.linalg.inv(np.linalg.cholesky(self._covariance))
 
     @cached_property
@@ -85,7 +93,9 @@ class Surface:
         return with_points @ self._weights, self.shape.leave_one_out * spread
 
     def left_out(self) -> tuple[np.ndarray, np.ndarray]:
-        """Errors at the points where each is left out in turn, and their expected standard deviations."""
+        """Errors at the points where each is left out in turn, and their expected standard
+        deviations.
+        """
         own = np.sum(self._whitening**2, axis=0)
         return self._weights / own, self.shape.leave_one_out / np.sqrt(own)
 

@@ -1,9 +1,11 @@
-"""The tables of this folder: measured averages of the reference map, and the theory as a Chebyshev series.
+"""The tables of this folder: measured averages of the reference map, and the theory as a Chebyshev
+series.
 
-Both are text with a head of lines ``# name: value``; ``python -m benchmarks reference`` makes them from a map.
-``averages.csv`` has a row for each point. Each average has the columns NAME, NAME_stderr and, where there is a bound on
-the errors other than sampling, NAME_bound; the head has the shape of its surface. ``theory.csv`` has a row for each
-term of the series of the logarithm of a prediction, in √(1 − α) and ν scaled to −1 ... 1.
+Both are text with a head of lines ``# name: value``; ``python -m benchmarks reference`` makes them
+from a map. ``averages.csv`` has a row for each point. Each average has the columns NAME,
+NAME_stderr and, where there is a bound on the errors other than sampling, NAME_bound; the head has
+the shape of its surface. ``theory.csv`` has a row for each term of the series of the logarithm of a
+prediction, in √(1 − α) and ν scaled to −1 ... 1.
 """
 
 from dataclasses import dataclass
@@ -27,10 +29,12 @@ MEASURED = {
 """Averages of which the table has a surface over a theory, and their units."""
 
 LENGTH = "correlation_length_from_pressure"
-"""L′ of ``sampling.enskog_factors``, in σ; its surface is that of the logarithm, and no bound is known."""
+"""L′ of ``sampling.enskog_factors``, in σ; its surface is that of the logarithm, unbounded."""
 
 RATIO = "force_ratio"
-"""The force ratio at the time step of the map; ``force_ratio_at_DT`` is another map's, NaN without a point there."""
+"""The force ratio at the time step of the map; ``force_ratio_at_DT`` is another map's, NaN where
+that has no point.
+"""
 
 THEORIES = {
     "gaussian_moments": "moments of an anisotropic Gaussian",
@@ -39,7 +43,7 @@ THEORIES = {
 """What the theory of the series is called."""
 
 THEORY = ("pressure", "shear_stress", "granular_temperature")
-"""What the series predict. The dissipation rate of a theory is its shear stress times the shear rate."""
+"""What the series predict. A theory's dissipation rate is its shear stress times the shear rate."""
 
 CORRECTED = "corrected_"
 """What the names of the series of ``corrected_shear`` begin with."""
@@ -49,7 +53,8 @@ FACTORS = ("local_temperature", "anisotropy", "chaos", "pairs", "binary")
 
 FOLDER = Path(__file__).parent
 _FORMAT_VERSION = "1"  # of the files
-_EXCESS = 0.01  # the force ratio's surface is that of asinh((ratio − 1)/0.01): linear below, logarithmic above
+# the force ratio's surface is that of asinh((ratio − 1)/0.01): linear below, logarithmic above
+_EXCESS = 0.01
 _BOUND_SHAPE = Shape(1.0, (1.0, 1.0))  # of the logarithm of a bound, which varies slowly
 _BOUND_STDERR = 0.02
 _LEAST_STDERR = 1e-3  # of a value of a surface; without clusters, that of the force ratio is 0
@@ -61,7 +66,9 @@ def theory_of(name: str) -> str:
 
 
 def to_surface(name: str, value: Any, stderr: Any, theory: Any = 1.0) -> tuple[Any, Any]:
-    """An average and its standard error as they are in its surface; measured averages are taken over the theory's."""
+    """An average and its standard error as they are in its surface; measured averages are taken
+    over the theory's.
+    """
     if name.startswith(RATIO):
         return np.arcsinh((value - 1) / _EXCESS), stderr / np.hypot(value - 1, _EXCESS)
     return np.log(value / theory), stderr / value
@@ -90,7 +97,10 @@ class Series:
             terms.append(2 * scaled * terms[-1] - terms[-2])
         stacked = xp.stack(terms, axis=-1)
         first, second = stacked[..., 0, :], stacked[..., 1, :]
-        return {name: xp.sum((first @ table) * second, axis=-1) for name, table in self.coefficients.items()}
+        return {
+            name: xp.sum((first @ table) * second, axis=-1)
+            for name, table in self.coefficients.items()
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +133,9 @@ class Table:
     def ratios(self) -> dict[float, Surface]:
         """The surfaces of the force ratio by time step."""
         others = {
-            float(name.split("_at_")[1]): x for name, x in self.surfaces.items() if name.startswith(f"{RATIO}_at_")
+            float(name.split("_at_")[1]): x
+            for name, x in self.surfaces.items()
+            if name.startswith(f"{RATIO}_at_")
         }
         return {float(self.head["timestep"]): self.surfaces[RATIO], **others}
 
@@ -134,12 +146,16 @@ class Table:
 
     @cached_property
     def bounds(self) -> dict[str, Surface]:
-        """The surfaces of the logarithm of every bound, over its average; that of the force ratio is not."""
+        """The surfaces of the logarithm of every bound, over its average; that of the force ratio
+        is not.
+        """
         found = {}
         for name in [name for name in self.shapes if f"{name}_bound" in self.columns]:
             over = 1.0 if name == RATIO else self.columns[name]
             values = np.log(self.columns[f"{name}_bound"] / over)
-            found[name] = Surface(self.points, values, np.full(values.shape, _BOUND_STDERR), _BOUND_SHAPE)
+            found[name] = Surface(
+                self.points, values, np.full(values.shape, _BOUND_STDERR), _BOUND_SHAPE
+            )
         return found
 
     @cached_property
@@ -148,15 +164,21 @@ class Table:
         for key, text in self.head.items():
             if key.startswith("surface "):
                 amplitude, first, second, noise, left_out = map(float, text.split())
-                found[key.removeprefix("surface ")] = Shape(amplitude, (first, second), noise, left_out)
+                found[key.removeprefix("surface ")] = Shape(
+                    amplitude, (first, second), noise, left_out
+                )
         return found
 
     def surface(self, name: str, shape: Shape) -> Surface:
         """The surface of an average, of a given shape."""
         theory = np.exp(self.series(self.points)[theory_of(name)]) if name in MEASURED else 1.0
-        values, stderrs = to_surface(name, self.columns[name], self.columns[f"{name}_stderr"], theory)
+        values, stderrs = to_surface(
+            name, self.columns[name], self.columns[f"{name}_stderr"], theory
+        )
         known = np.isfinite(values)
-        return Surface(self.points[known], values[known], np.maximum(stderrs[known], _LEAST_STDERR), shape)
+        return Surface(
+            self.points[known], values[known], np.maximum(stderrs[known], _LEAST_STDERR), shape
+        )
 
 
 @cache
@@ -169,9 +191,15 @@ def read_table(folder: Path) -> Table:
     """The table in a folder."""
     head, columns = read_columns(folder / "averages.csv")
     theory_head, terms = read_columns(folder / "theory.csv")
-    low, high = (np.array([float(x) for x in theory_head[name].split()]) for name in ("low", "high"))
+    low, high = (
+        np.array([float(x) for x in theory_head[name].split()]) for name in ("low", "high")
+    )
     count = round(np.sqrt(len(terms["first"])))
-    coefficients = {name: x.reshape(count, count) for name, x in terms.items() if name not in ("first", "second")}
+    coefficients = {
+        name: x.reshape(count, count)
+        for name, x in terms.items()
+        if name not in ("first", "second")
+    }
     return Table(theory_head | head, columns, Series(low, high, coefficients))
 
 
@@ -185,8 +213,15 @@ def read_columns(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
     return head, dict(zip(names, np.array(rows, float).T, strict=True))
 
 
-def write_columns(path: Path, head: dict[str, Any], columns: dict[str, Any], digits: int = 6) -> None:
+def write_columns(
+    path: Path, head: dict[str, Any], columns: dict[str, Any], digits: int = 6
+) -> None:
     """Write a file that ``read_columns`` reads."""
-    lines = [f"# {name}: {value}" for name, value in {"format_version": _FORMAT_VERSION, **head}.items()]
-    rows = [",".join(f"{value:.{digits}g}" for value in row) for row in zip(*columns.values(), strict=True)]
+    lines = [
+        f"# {name}: {value}" for name, value in {"format_version": _FORMAT_VERSION, **head}.items()
+    ]
+    rows = [
+        ",".join(f"{value:.{digits}g}" for value in row)
+        for row in zip(*columns.values(), strict=True)
+    ]
     path.write_text("\n".join([*lines, ",".join(columns), *rows]) + "\n", encoding="utf-8")

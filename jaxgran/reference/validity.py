@@ -1,7 +1,9 @@
-"""Where kinetic theory can predict the stress of a granular flow: the answer for any restitution and packing fraction.
+"""Where kinetic theory can predict the stress of a granular flow: the answer for any restitution
+and packing fraction.
 
-Nothing is simulated. Averages are read from the surfaces of a reference map that is shipped with the package (module
-``table``), the prediction of the theory from a series. Both are smooth, so that derivatives exist.
+Nothing is simulated. Averages are read from the surfaces of a reference map that is shipped with
+the package (module ``table``), the prediction of the theory from a series. Both are smooth, so that
+derivatives exist.
 """
 
 from functools import partial
@@ -12,7 +14,14 @@ import numpy as np
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import with_error
 from jaxgran.reference.evaluation import estimates, over_range
-from jaxgran.reference.table import CORRECTED, FACTORS, Table, excess_from_surface, shipped_table, theory_of
+from jaxgran.reference.table import (
+    CORRECTED,
+    FACTORS,
+    Table,
+    excess_from_surface,
+    shipped_table,
+    theory_of,
+)
 
 COLUMNS = ("average", "measured", "kinetic theory", "error", "error if corrected")
 """What ``Validity.rows`` gives of every average."""
@@ -22,7 +31,10 @@ _CAUSES = {  # what is said where a factor is below one, and where it is above
     "local_temperature": ("long waves of velocity raise the granular temperature",) * 2,
     "anisotropy": ("velocities are anisotropic",) * 2,
     "chaos": ("velocities of colliding grains are correlated",) * 2,
-    "pairs": ("fewer pairs are at contact than in equilibrium", "more pairs are at contact than in equilibrium"),
+    "pairs": (
+        "fewer pairs are at contact than in equilibrium",
+        "more pairs are at contact than in equilibrium",
+    ),
     "binary": ("grains collide in clusters",) * 2,
 }
 
@@ -30,26 +42,32 @@ _CAUSES = {  # what is said where a factor is below one, and where it is above
 class Validity(NamedTuple):
     """What was measured at a restitution and a packing fraction, and what kinetic theory says.
 
-    All arrays have the shape to which restitution and packing fraction broadcast; () for two numbers. ``NAME_ci95`` is
-    the half-width of a 95 % interval.
+    All arrays have the shape to which restitution and packing fraction broadcast; () for two
+    numbers. ``NAME_ci95`` is the half-width of a 95 % interval.
 
-    =============  ==================================================================================================
+    =============  =================================================================================
     field          content
-    =============  ==================================================================================================
+    =============  =================================================================================
     measured       average by name: pressure and shear_stress in m/t², granular_temperature and
                    local_granular_temperature in m(σ/t)², dissipation_rate in m/t³, force_ratio
-    measured_ci95  of each: sampling, interpolation, time step, tolerance, and the difference from a large system
-    theory         pressure, shear_stress, granular_temperature and dissipation_rate of kinetic theory, same units
-    error          theory over measured, less one, of all but the granular temperature and the force ratio; the theory's
+    measured_ci95  of each: sampling, interpolation, time step, tolerance, and the difference from a
+                   large system
+    theory         pressure, shear_stress, granular_temperature and dissipation_rate of kinetic
+                   theory, same units
+    error          theory over measured, less one, of all but the granular temperature and the force
+                   ratio; the theory's
                    temperature is compared with the local one
     error_ci95     of each
-    corrected      the same predictions by ``corrected_shear``, with measured laws of correlations and pairs
+    corrected      the same predictions by ``corrected_shear``, with measured laws of correlations
+                   and pairs
     corrected_error, corrected_error_ci95
                    as error and error_ci95
-    factors        the assumptions of Enskog's contact pressure at the measured granular temperature, by name: factors
-                   whose product is the measured contact pressure over Enskog's (``sampling.enskog_factors``)
+    factors        the assumptions of Enskog's contact pressure at the measured granular
+                   temperature, by name: factors
+                   whose product is the measured contact pressure over Enskog's
+                   (``sampling.enskog_factors``)
     factors_ci95   of each, from sampling and interpolation at the number of grains of the map
-    =============  ==================================================================================================
+    =============  =================================================================================
     """
 
     restitution: Any
@@ -66,7 +84,8 @@ class Validity(NamedTuple):
     factors_ci95: dict[str, Any]
 
     def fails_first(self) -> Any:
-        """The name of the factor that is furthest from one, in logarithm; "none" where all are within 2 % of one.
+        """The name of the factor that is furthest from one, in logarithm; "none" where all are
+        within 2 % of one.
 
         For values that are known, not traced by JAX: a string, or an array of strings.
         """
@@ -76,22 +95,32 @@ class Validity(NamedTuple):
         return found if found.ndim else str(found)
 
     def at(self, place: Any) -> "Validity":
-        """One flow of an array of flows, or a part of them; for values that are known, not traced."""
+        """One flow of an array of flows, or a part of them; for values that are known, not
+        traced.
+        """
 
         def part(x: Any) -> Any:
-            return {name: part(one) for name, one in x.items()} if isinstance(x, dict) else np.asarray(x)[place]
+            return (
+                {name: part(one) for name, one in x.items()}
+                if isinstance(x, dict)
+                else np.asarray(x)[place]
+            )
 
         return Validity(*map(part, self))
 
     def verdict(self) -> Any:
-        """One sentence for every flow: a string, or an array of strings. For values that are known, not traced."""
+        """One sentence for every flow: a string, or an array of strings. For values that are known,
+        not traced.
+        """
         sentences = np.empty(np.shape(self.error["pressure"]), object)
         for place in np.ndindex(sentences.shape):
             sentences[place] = self.at(place)._sentence()
         return sentences if sentences.ndim else sentences.item()
 
     def rows(self) -> list[list[str]]:
-        """The ``COLUMNS`` of every average of one flow, as texts; an average and an error with a 95 % interval."""
+        """The ``COLUMNS`` of every average of one flow, as texts; an average and an error with a 95
+        % interval.
+        """
         found = []
         for name, measured in self.measured.items():
             predicted = self.theory.get(name.removeprefix("local_"))
@@ -102,7 +131,9 @@ class Validity(NamedTuple):
                     (self.error[name], self.error_ci95[name]),
                     (self.corrected_error[name], self.corrected_error_ci95[name]),
                 )
-                errors = [f"{with_error(100 * float(x), 100 * float(ci95))} %" for x, ci95 in of_theories]
+                errors = [
+                    f"{with_error(100 * float(x), 100 * float(ci95))} %" for x, ci95 in of_theories
+                ]
             interval = with_error(float(measured), float(self.measured_ci95[name]))
             found.append([name.replace("_", " "), interval, theory, *errors])
         return found
@@ -113,15 +144,23 @@ class Validity(NamedTuple):
         error, ci95 = (100 * float(x["pressure"]) for x in (self.error, self.error_ci95))
         if abs(error) > ci95:
             side = "over" if error > 0 else "under"
-            start = f"Kinetic theory {side}estimates the pressure by {with_error(abs(error), ci95)} %"
+            start = (
+                f"Kinetic theory {side}estimates the pressure by {with_error(abs(error), ci95)} %"
+            )
         else:
-            start = f"Kinetic theory agrees with the measured pressure (error {with_error(error, ci95)} %)"
+            start = (
+                "Kinetic theory agrees with the measured pressure (error "
+                f"{with_error(error, ci95)} %)"
+            )
         if first == "none":
             cause = "; no assumption changes the contact pressure by more than 2 %"
         else:
             factor = float(self.factors[first])
             why = f"a factor of {factor:.3g} in the contact pressure at the measured temperature"
-            cause = f"; the largest departure from Enskog's assumptions: {_CAUSES[first][factor > 1]} ({why})"
+            cause = (
+                "; the largest departure from Enskog's assumptions: "
+                f"{_CAUSES[first][factor > 1]} ({why})"
+            )
         ratio, ratio_ci95 = (float(x["force_ratio"]) for x in (self.measured, self.measured_ci95))
         off = max(ratio - 1, 0.0) + ratio_ci95
         if off < 0.05:
@@ -132,20 +171,21 @@ class Validity(NamedTuple):
 
 
 def validity(restitution: Any, packing_fraction: Any) -> Validity:
-    """Measured stresses, temperatures and dissipation of a flow, what kinetic theory says of them, and which fails.
+    """Measured stresses, temperatures and dissipation of a flow, what kinetic theory says of them,
+    and which fails.
 
     Args:
       restitution: α, a number or an array.
       packing_fraction: ν, a number or an array; the two broadcast.
 
     Returns:
-      A ``Validity``. Its ``verdict()`` says it in a sentence. Numbers and arrays that are known give arrays of NumPy in
-      double precision. ``jax.jit``, ``jax.vmap`` and derivatives apply, in double precision only; where a traced value
-      is outside the measured range, the result is NaN.
+      A ``Validity``. Its ``verdict()`` says it in a sentence. Numbers and arrays that are known
+      give arrays of NumPy in double precision. ``jax.jit``, ``jax.vmap`` and derivatives apply, in
+      double precision only; where a traced value is outside the measured range, the result is NaN.
 
     Raises:
-      InputError: (a ValueError) a value is outside the measured range, which the message names; or JAX traces it
-        without ``jax_enable_x64``.
+      InputError: (a ValueError) a value is outside the measured range, which the message names; or
+        JAX traces it without ``jax_enable_x64``.
 
     Examples:
       >>> found = validity(0.98, 0.5)
@@ -159,7 +199,9 @@ def validity(restitution: Any, packing_fraction: Any) -> Validity:
 
 def _evaluated(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
     """The dictionaries of a ``Validity`` at coordinates in the measured range."""
-    measured, ci95, theory, error, error_ci95, corrected, corrected_error, corrected_ci95 = ({} for _ in range(8))
+    measured, ci95, theory, error, error_ci95, corrected, corrected_error, corrected_ci95 = (
+        {} for _ in range(8)
+    )
     logs = table.series(where, xp)
     for name, one in estimates(table, where, xp).items():
         log = logs[CORRECTED + theory_of(name)]
@@ -170,7 +212,10 @@ def _evaluated(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
             error[name] = xp.expm1(-one.over)
             error_ci95[name] = xp.exp(-one.over) * xp.sinh(one.half)
             over = one.over + one.theory - log
-            corrected_error[name], corrected_ci95[name] = xp.expm1(-over), xp.exp(-over) * xp.sinh(one.half)
+            corrected_error[name], corrected_ci95[name] = (
+                xp.expm1(-over),
+                xp.exp(-over) * xp.sinh(one.half),
+            )
     value, stderr = table.surfaces["force_ratio"](where, xp)
     measured["force_ratio"] = 1 + excess_from_surface(value, xp)
     sampling = excess_from_surface(HALF_INTERVAL * stderr, xp) * xp.cosh(value)
@@ -178,6 +223,9 @@ def _evaluated(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
     factors, factors_ci95 = {}, {}
     for name in FACTORS:
         log, stderr = table.surfaces[f"pressure_{name}"](where, xp)
-        factors[name], factors_ci95[name] = xp.exp(log), xp.exp(log) * xp.sinh(HALF_INTERVAL * stderr)
+        factors[name], factors_ci95[name] = (
+            xp.exp(log),
+            xp.exp(log) * xp.sinh(HALF_INTERVAL * stderr),
+        )
     corrections = corrected, corrected_error, corrected_ci95
     return measured, ci95, theory, error, error_ci95, *corrections, factors, factors_ci95

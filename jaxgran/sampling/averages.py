@@ -22,23 +22,30 @@ def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) 
       shear_rate: γ̇, in 1/t.
 
     Returns:
-      NumPy arrays, or those of JAX where it traces, with the leading axes of the tally; tensors have two more axes,
-      (2, 2). The diagonal of a stress Σ^{ab} is positive, and the shear stress is −Σ^{xy}, as in the paper. An average
-      over no contacts is NaN.
+      NumPy arrays, or those of JAX where it traces, with the leading axes of the tally; tensors
+      have two more axes, (2, 2). The diagonal of a stress Σ^{ab} is positive, and the shear stress
+      is −Σ^{xy}, as in the paper. An average over no contacts is NaN.
     """
     tally, area, shear_rate = in_numpy((tally, area, shear_rate))
     with np.errstate(divide="ignore", invalid="ignore"):  # NumPy warns of these, JAX does not
-        return _averages(tally, area, grains, shear_rate, _namespace(*vars(tally).values(), area, shear_rate))
+        return _averages(
+            tally, area, grains, shear_rate, _namespace(*vars(tally).values(), area, shear_rate)
+        )
 
 
-def _averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike, xp: Any) -> dict[str, Array]:
+def _averages(
+    tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike, xp: Any
+) -> dict[str, Array]:
     area, shear_rate = xp.asarray(area), xp.asarray(shear_rate)
     volume = area * tally.duration
     contact, binary, kinetic = (
-        moment / volume[..., None, None] for moment in (tally.contact_moment, tally.binary_moment, tally.kinetic_moment)
+        moment / volume[..., None, None]
+        for moment in (tally.contact_moment, tally.binary_moment, tally.kinetic_moment)
     )
     in_clusters, in_all = tally.cluster_moment, tally.contact_moment
-    contact_pressure, kinetic_pressure = ((s[..., 0, 0] + s[..., 1, 1]) / 2 for s in (contact, kinetic))
+    contact_pressure, kinetic_pressure = (
+        (s[..., 0, 0] + s[..., 1, 1]) / 2 for s in (contact, kinetic)
+    )
     total_pressure = contact_pressure + kinetic_pressure
     total_shear = -contact[..., 0, 1] - kinetic[..., 0, 1]
     work = total_shear * shear_rate * volume
@@ -52,7 +59,9 @@ def _averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike,
         "longwave_energy_ratio": _ratio(tally.wave_kinetic, temperature * tally.duration),
         "dissipation_rate": tally.dissipation / volume,
         "binary_dissipation_rate": tally.binary_dissipation / volume,
-        "cluster_pressure_share": _ratio(*(xp.trace(x, axis1=-2, axis2=-1) for x in (in_clusters, in_all))),
+        "cluster_pressure_share": _ratio(
+            *(xp.trace(x, axis1=-2, axis2=-1) for x in (in_clusters, in_all))
+        ),
         "cluster_shear_share": _ratio(in_clusters[..., 0, 1], in_all[..., 0, 1]),
         "coordination_number": 2 * tally.loaded_contacts / (grains * tally.steps),
         "macroscopic_friction": total_shear / total_pressure,
@@ -64,7 +73,9 @@ def _averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike,
         "mean_overlap": _ratio(tally.overlap, tally.contacts),
         "max_overlap": tally.largest_overlap,
         "momentum_drift": tally.momentum_drift,
-        "energy_balance_error": _ratio(work - tally.dissipation - tally.energy_change, xp.abs(work)),
+        "energy_balance_error": _ratio(
+            work - tally.dissipation - tally.energy_change, xp.abs(work)
+        ),
         "complementarity_power": _ratio(tally.complementarity, xp.abs(work)),
         "contact_stress": contact,
         "binary_stress": binary,
@@ -74,11 +85,15 @@ def _averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike,
 
 
 def _namespace(*values: Any) -> Any:
-    """``jax.numpy`` for JAX arrays, or else NumPy, which is 100 times faster for the few numbers of a point."""
+    """``jax.numpy`` for JAX arrays, or else NumPy, which is 100 times faster for the few numbers of
+    a point.
+    """
     return jnp if any(isinstance(x, jax.Array) for x in values) else np
 
 
 def _ratio(numerator: Array, denominator: Array) -> Array:
     """The quotient; NaN without a warning where the denominator is zero."""
     xp = _namespace(numerator, denominator)
-    return xp.where(denominator == 0, xp.nan, numerator / xp.where(denominator == 0, 1, denominator))
+    return xp.where(
+        denominator == 0, xp.nan, numerator / xp.where(denominator == 0, 1, denominator)
+    )

@@ -1,11 +1,12 @@
 """Batches of replicas: flows stacked into one, and the functions that advance them.
 
-All arrays of a batch have a leading (replicas,) axis. Only an ``AdvanceBatch`` changes its states. ``advance_batch`` is
-the plain one. Wrappers around it report progress, record frames or keep a journal. An ``ObserveBatch`` also takes a
-function of a user's, whose sums come with the tally.
+All arrays of a batch have a leading (replicas,) axis. Only an ``AdvanceBatch`` changes its states.
+``advance_batch`` is the plain one. Wrappers around it report progress, record frames or keep a
+journal. An ``ObserveBatch`` also takes a function of a user's, whose sums come with the tally.
 
-JAX may see several devices, of this host or of all hosts that ``jax.distributed`` connects. Each device then advances
-its share of the replicas. Devices wait for each other only at the end of a call. All hosts get all results.
+JAX may see several devices, of this host or of all hosts that ``jax.distributed`` connects. Each
+device then advances its share of the replicas. Devices wait for each other only at the end of a
+call. All hosts get all results.
 """
 
 from collections.abc import Callable
@@ -32,8 +33,11 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 from jaxgran.sampling.observe import Observable, advance_and_observe
 
-Report = Callable[[ArrayLike, ArrayLike], None]  # called with time step and number of steps of each replica
-# Advances each replica by its number of steps, and a wrapper that adds reports or records and leaves the states alone.
+Report = Callable[
+    [ArrayLike, ArrayLike], None
+]  # called with time step and number of steps of each replica
+# Advances each replica by its number of steps, and a wrapper that adds reports or records and
+# leaves the states alone.
 AdvanceBatch = Callable[[ShearFlow, Numerics, State, Array], tuple[State, Tally]]
 AdvanceWrapper = Callable[[AdvanceBatch], AdvanceBatch]
 
@@ -42,7 +46,12 @@ class ObserveBatch(Protocol):
     """An ``AdvanceBatch`` that can observe the replicas while it advances them."""
 
     def __call__(
-        self, flow: ShearFlow, numerics: Numerics, state: State, steps: Array, observe: Observable | None = None
+        self,
+        flow: ShearFlow,
+        numerics: Numerics,
+        state: State,
+        steps: Array,
+        observe: Observable | None = None,
     ) -> tuple[State, Tally]: ...
 
 
@@ -62,18 +71,25 @@ def stack(flows: list[ShearFlow]) -> ShearFlow:
 
 
 def for_replicas(numerics: Numerics, count: int) -> Numerics:
-    """The same numerics for every replica of a batch: numbers of the solver with a leading (replicas,) axis."""
+    """The same numerics for every replica of a batch: numbers of the solver with a leading
+    (replicas,) axis.
+    """
 
     def repeated(value: Any) -> np.ndarray:
         number = np.asarray(value)
-        kind = np.dtype(np.int32) if number.dtype.kind in "iu" else jax.dtypes.canonicalize_dtype(number.dtype)
+        kind = (
+            np.dtype(np.int32)
+            if number.dtype.kind in "iu"
+            else jax.dtypes.canonicalize_dtype(number.dtype)
+        )
         return np.broadcast_to(number.astype(kind), (count, *number.shape))
 
     return jax.tree.map(repeated, numerics)
 
 
 def replicated(function: Callable, lockstep: bool) -> Callable:
-    """The function of one replica for a batch: ``vmap`` with a named axis in lockstep, otherwise ``lax.map``.
+    """The function of one replica for a batch: ``vmap`` with a named axis in lockstep, otherwise
+    ``lax.map``.
 
     With several devices, each computes its share of the replicas.
     """
@@ -86,7 +102,9 @@ def replicated(function: Callable, lockstep: bool) -> Callable:
 
 
 def _on_all_devices(batched: Callable) -> Callable:
-    """The function of a batch with equal shares on all devices; copies of replicas fill the last share."""
+    """The function of a batch with equal shares on all devices; copies of replicas fill the last
+    share.
+    """
     devices = jax.devices()
     mesh = Mesh(np.asarray(devices), (_DEVICES,))
 
@@ -94,7 +112,11 @@ def _on_all_devices(batched: Callable) -> Callable:
         return jax.tree.map(lambda x: lax.all_gather(x, _DEVICES, tiled=True), batched(*arguments))
 
     sharded = jax.shard_map(
-        gathered, mesh=mesh, in_specs=PartitionSpec(_DEVICES), out_specs=PartitionSpec(), check_vma=False
+        gathered,
+        mesh=mesh,
+        in_specs=PartitionSpec(_DEVICES),
+        out_specs=PartitionSpec(),
+        check_vma=False,
     )
 
     def on_all_devices(*arguments):
@@ -114,10 +136,11 @@ def batch_program(
     register: Callable[[], None] = lambda: None,
     compiled: Callable[[Callable, Callable[[], None]], Callable] = persistent_jit,
 ) -> Callable:
-    """The compiled function of one replica for a batch, called with batched arguments and ``lockstep``.
+    """The compiled function of one replica for a batch, called with batched arguments and
+    ``lockstep``.
 
-    Replicas that advance in turn do so in groups of one size. So one compiled program serves batches of any size. For
-    ``register`` see ``persistent_jit``.
+    Replicas that advance in turn do so in groups of one size. So one compiled program serves
+    batches of any size. For ``register`` see ``persistent_jit``.
     """
 
     @wraps(function)
@@ -157,11 +180,15 @@ def batch_program(
 
 
 def _on_host(array: Array) -> Array | np.ndarray:
-    """The array in memory of the host, where the numbers of a replica are cheap to take; random keys stay with JAX."""
+    """The array in memory of the host, where the numbers of a replica are cheap to take; random
+    keys stay with JAX.
+    """
     return array if jax.dtypes.issubdtype(array.dtype, jax.dtypes.prng_key) else np.asarray(array)
 
 
-def _advance_replica(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
+def _advance_replica(
+    flow: ShearFlow, numerics: Numerics, state: State, steps: Array
+) -> tuple[State, Tally]:
     return advance_and_observe(flow, numerics, state, steps, None)
 
 
@@ -170,16 +197,24 @@ _advance_replicas = batch_program(_advance_replica, register_numba)
 
 @lru_cache(maxsize=8)
 def _observe_replicas(observe: Observable) -> Callable:
-    """The program of ``advance_batch`` with a user's function, of which no key for a file is known."""
+    """The program of ``advance_batch`` with a user's function, of which no key for a file is
+    known.
+    """
 
-    def observe_replica(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
+    def observe_replica(
+        flow: ShearFlow, numerics: Numerics, state: State, steps: Array
+    ) -> tuple[State, Tally]:
         return advance_and_observe(flow, numerics, state, steps, observe)
 
     return batch_program(observe_replica, compiled=lambda function, _: jax.jit(function))
 
 
 def advance_batch(
-    flow: ShearFlow, numerics: Numerics, state: State, steps: Array, observe: Observable | None = None
+    flow: ShearFlow,
+    numerics: Numerics,
+    state: State,
+    steps: Array,
+    observe: Observable | None = None,
 ) -> tuple[State, Tally]:
     """Advance each replica of a batch by its number of time steps.
 
@@ -196,8 +231,12 @@ def advance_batch(
     return program(flow, numerics, state, steps, lockstep=in_lockstep())
 
 
-def advance_on_all_cores(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
-    """``advance_batch`` with the same bits; replicas that advance in turn are shared out to threads."""
+def advance_on_all_cores(
+    flow: ShearFlow, numerics: Numerics, state: State, steps: Array
+) -> tuple[State, Tally]:
+    """``advance_batch`` with the same bits; replicas that advance in turn are shared out to
+    threads.
+    """
     count = len(steps)
     threads = min(usable_threads(), count)
     if threads == 1 or in_lockstep() or jax.device_count() > 1:
@@ -208,7 +247,11 @@ def advance_on_all_cores(flow: ShearFlow, numerics: Numerics, state: State, step
         return advance_batch(*jax.tree.map(lambda x: x[first : first + share], batch))
 
     share = min(_GROUP, -(-count // threads))
-    shares = dict(in_threads(advanced, [(first,) for first in range(0, count, share)], threads, lambda _: None))
+    shares = dict(
+        in_threads(
+            advanced, [(first,) for first in range(0, count, share)], threads, lambda _: None
+        )
+    )
     return jax.tree.map(lambda *x: np.concatenate(x), *(shares[k] for k in sorted(shares)))
 
 
@@ -216,7 +259,11 @@ def reporting(advance: ObserveBatch, report: Report) -> ObserveBatch:
     """The same advance with a report after each call."""
 
     def advance_and_report(
-        flow: ShearFlow, numerics: Numerics, state: State, steps: Array, observe: Observable | None = None
+        flow: ShearFlow,
+        numerics: Numerics,
+        state: State,
+        steps: Array,
+        observe: Observable | None = None,
     ) -> tuple[State, Tally]:
         state, tally = advance(flow, numerics, state, steps, observe)
         report(flow.timestep, tally.steps)

@@ -12,14 +12,18 @@ from jaxgran.statistics import drift
 _BLOCKS = 16  # of a sample in this test
 _LARGEST_RATIO = 4.0  # a sample drifts if it exceeds this ratio of drift to standard error
 _LARGEST_DRIFT = 0.2  # and this drift in ln T or ln P
-_CLUSTER_STRAIN = 1.0  # over which the clusters of a dissipative flow move; blocks within it are correlated
+_CLUSTER_STRAIN = (
+    1.0  # over which the clusters of a dissipative flow move; blocks within it are correlated
+)
 
 
 def is_drifting(seeds: Sequence[Sample], correlation_strain: float) -> bool:
-    """Whether ln P or ln T drifts from the first to the second half of the samples, averaged over the seeds.
+    """Whether ln P or ln T drifts from the first to the second half of the samples, averaged over
+    the seeds.
 
-    The means of the halves must differ by more than four standard errors and by more than 0.2. A drift of
-    one seed alone is noise. Blocks are correlated over at least the correlation strain of the flow.
+    The means of the halves must differ by more than four standard errors and by more than 0.2. A
+    drift of one seed alone is noise. Blocks are correlated over at least the correlation strain of
+    the flow.
 
     Args:
       seeds: samples of one flow with NumPy arrays, of 16 blocks or a multiple.
@@ -35,7 +39,9 @@ def is_drifting(seeds: Sequence[Sample], correlation_strain: float) -> bool:
 
 
 def drifts(series: np.ndarray, least_correlation: float = 0.0) -> bool:
-    """Whether the two halves of a series differ significantly and by more than is accepted; True if not finite."""
+    """Whether the two halves of a series differ significantly and by more than is accepted; True if
+    not finite.
+    """
     difference, error = drift(series, least_correlation)
     return not abs(difference) <= max(_LARGEST_RATIO * error, _LARGEST_DRIFT)
 

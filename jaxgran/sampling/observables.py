@@ -10,7 +10,9 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Array
 
-STRESS_UNIT = "m / t^2"  # in two dimensions; t is the time unit of the shear rate, 1/shear rate by default
+STRESS_UNIT = (
+    "m / t^2"  # in two dimensions; t is the time unit of the shear rate, 1/shear rate by default
+)
 TENSOR_AXES = ("axis_a", "axis_b")  # of the centre-to-centre vector, of the force
 
 
@@ -21,9 +23,11 @@ class Average:
     Args:
       meaning: what it is, without its unit.
       unit: "1" for a pure number.
-      group: of the file of a map, "/" for its root; the tables of ``jaxgran run`` have the same groups.
+      group: of the file of a map, "/" for its root; the tables of ``jaxgran run`` have the same
+        groups.
       tensor: whether it has the two dimensions ``TENSOR_AXES`` of two components.
-      extreme: whether it is the largest of all time steps, so that its error is the spread over blocks.
+      extreme: whether it is the largest of all time steps, so that its error is the spread over
+        blocks.
     """
 
     meaning: str
@@ -57,31 +61,52 @@ class Average:
     @property
     def meaning_of_error(self) -> str:
         """What ``NAME_stderr`` is."""
-        return f"{'standard deviation over blocks' if self.extreme else 'standard error'} of {self.meaning}"
+        return (
+            f"{'standard deviation over blocks' if self.extreme else 'standard error'} of "
+            f"{self.meaning}"
+        )
 
 
 class Averages:
-    """Every observable as an attribute, from the mapping ``averages``: this is the table of all observables."""
+    """Every observable as an attribute, from the mapping ``averages``: this is the table of all
+    observables.
+    """
 
     force_ratio = Average("mean contact force over mean binary contact force")
     stress_ratio = Average("contact stress over binary stress, by component", tensor=True)
     pressure = Average("pressure, contact and kinetic", STRESS_UNIT)
     shear_stress = Average("shear stress, contact and kinetic, positive", STRESS_UNIT)
     macroscopic_friction = Average("shear stress over pressure")
-    inertial_number = Average("shear rate times the square root of the mass of a mean grain over the pressure")
+    inertial_number = Average(
+        "shear rate times the square root of the mass of a mean grain over the pressure"
+    )
     granular_temperature = Average("granular temperature, sum of m c^2 over 2 N", "m sigma^2 / t^2")
     local_granular_temperature = Average(
-        "granular temperature relative to the mean velocity of boxes of about 25 grains", "m sigma^2 / t^2"
+        "granular temperature relative to the mean velocity of boxes of about 25 grains",
+        "m sigma^2 / t^2",
     )
-    coordination_number = Average("contacts per grain that carry an impulse (twice their number over the grains)")
-    collision_rate = Average("approaching contacts per grain and unit strain, each grain counting its own")
+    coordination_number = Average(
+        "contacts per grain that carry an impulse (twice their number over the grains)"
+    )
+    collision_rate = Average(
+        "approaching contacts per grain and unit strain, each grain counting its own"
+    )
 
-    contact_stress = Average("stress of the contact forces", STRESS_UNIT, group="stresses", tensor=True)
-    binary_stress = Average(
-        "stress of the contact forces if collisions were binary", STRESS_UNIT, group="stresses", tensor=True
+    contact_stress = Average(
+        "stress of the contact forces", STRESS_UNIT, group="stresses", tensor=True
     )
-    kinetic_stress = Average("stress of the peculiar motion", STRESS_UNIT, group="stresses", tensor=True)
-    dissipation_rate = Average("energy that contacts lose per unit area and time", "m / t^3", group="stresses")
+    binary_stress = Average(
+        "stress of the contact forces if collisions were binary",
+        STRESS_UNIT,
+        group="stresses",
+        tensor=True,
+    )
+    kinetic_stress = Average(
+        "stress of the peculiar motion", STRESS_UNIT, group="stresses", tensor=True
+    )
+    dissipation_rate = Average(
+        "energy that contacts lose per unit area and time", "m / t^3", group="stresses"
+    )
     binary_dissipation_rate = Average(
         "energy that contacts would lose if collisions were binary", "m / t^3", group="stresses"
     )
@@ -93,21 +118,34 @@ class Averages:
     )
 
     iterations = Average("solver iterations per solved network", group="diagnostics")
-    worst_residual = Average("largest relative residual of a solved network", group="diagnostics", extreme=True)
-    unconverged_share = Average("share of the solved networks that ended above the tolerance", group="diagnostics")
-    mean_overlap = Average("mean overlap of the contacts of a solved network", "sigma", group="diagnostics")
-    max_overlap = Average("largest overlap of a contact", "sigma", group="diagnostics", extreme=True)
+    worst_residual = Average(
+        "largest relative residual of a solved network", group="diagnostics", extreme=True
+    )
+    unconverged_share = Average(
+        "share of the solved networks that ended above the tolerance", group="diagnostics"
+    )
+    mean_overlap = Average(
+        "mean overlap of the contacts of a solved network", "sigma", group="diagnostics"
+    )
+    max_overlap = Average(
+        "largest overlap of a contact", "sigma", group="diagnostics", extreme=True
+    )
     momentum_drift = Average(
-        "largest total momentum over the sum of the momenta of the grains", group="diagnostics", extreme=True
+        "largest total momentum over the sum of the momenta of the grains",
+        group="diagnostics",
+        extreme=True,
     )
     energy_balance_error = Average(
-        "shear work less dissipation and growth of the kinetic energy, over shear work", group="diagnostics"
+        "shear work less dissipation and growth of the kinetic energy, over shear work",
+        group="diagnostics",
     )
     complementarity_power = Average(
-        "sum of p (u+ + alpha u-)/2, which an exact solve makes zero, over shear work", group="diagnostics"
+        "sum of p (u+ + alpha u-)/2, which an exact solve makes zero, over shear work",
+        group="diagnostics",
     )
     longwave_energy_ratio = Average(
-        "kinetic energy of the four longest waves of velocity over that of equipartition", group="diagnostics"
+        "kinetic energy of the four longest waves of velocity over that of equipartition",
+        group="diagnostics",
     )
 
 
@@ -120,5 +158,7 @@ GROUPS = {
 
 
 def unit_attributes(unit: str) -> dict[str, str]:
-    """The attributes of a dataset's variable that give its unit: all are numbers in units of m, σ and t."""
+    """The attributes of a dataset's variable that give its unit: all are numbers in units of m, σ
+    and t.
+    """
     return {"units": "1"} if unit == "1" else {"reduced_unit": unit, "units": "1"}

@@ -1,4 +1,6 @@
-"""A user's function that observes every time step of a sample: its evaluation, its checks and its digest."""
+"""A user's function that observes every time step of a sample: its evaluation, its checks and its
+digest.
+"""
 
 import hashlib
 import re
@@ -37,12 +39,15 @@ def advance_and_observe(
     """``advance``, with the sums of what a function observes in ``Tally.observed``."""
     if observe is None:
         return advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
-    end, tally, sums = advance_observed(flow, numerics, state, steps, partial(_observe_step, observe))
+    end, tally, sums = advance_observed(
+        flow, numerics, state, steps, partial(_observe_step, observe)
+    )
     return end, replace(tally, observed=sums)
 
 
 def observed_shapes(observe: Observable, flow: ShearFlow) -> Any:
-    """Shape and dtype of the sums of what a function observes in a flow, a pytree of ``jax.ShapeDtypeStruct``.
+    """Shape and dtype of the sums of what a function observes in a flow, a pytree of
+    ``jax.ShapeDtypeStruct``.
 
     Raises:
       InputError: the function does not return real numbers, or does not sum over contacts.
@@ -61,7 +66,9 @@ def dimensions_of(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
 
 
 def digest_of(observe: Observable, flow: ShearFlow) -> str:
-    """A hash of what a function computes in a flow: jaxpr, constants of it and of what it calls, and results."""
+    """A hash of what a function computes in a flow: jaxpr, constants of it and of what it calls,
+    and results.
+    """
 
     def without(state: State) -> Any:
         return without_contacts(partial(_observe_step, observe, flow, state), state.positions.dtype)
@@ -92,15 +99,19 @@ def _constants(part: Any) -> Iterator[np.ndarray]:
         yield np.asarray(part)
 
 
-def _observe_step(observe: Observable, flow: ShearFlow, state: State, contacts: Contacts, impulses: Array) -> Any:
+def _observe_step(
+    observe: Observable, flow: ShearFlow, state: State, contacts: Contacts, impulses: Array
+) -> Any:
     """The result of ``observe`` for the contacts and impulses of one step."""
     snapshot = snapshot_of(flow, state, contacts, impulses, jnp.int32(Status.ok))
     try:
         return observe(snapshot)
     except _NEEDS_VALUES as error:
         raise InputError(
-            f"observe must compute with jax.numpy, since JAX traces its snapshot, and {_line_of(observe, error)} "
-            "needs the values: jnp.sum and jnp.where take the place of functions of NumPy, float() and if."
+            "observe must compute with jax.numpy, since JAX traces its snapshot, and "
+            f"{_line_of(observe, error)} "
+            "needs the values: jnp.sum and jnp.where take the place of functions of NumPy, float() "
+            "and if."
         ) from None
 
 
@@ -117,4 +128,6 @@ def _abstract_state(grains: int) -> State:
     def array(*shape: int) -> Any:
         return jax.ShapeDtypeStruct(shape, jnp.result_type(float))
 
-    return State(Grains(array(grains), array(grains)), array(grains, 2), array(grains, 2), array(), array())
+    return State(
+        Grains(array(grains), array(grains)), array(grains, 2), array(grains, 2), array(), array()
+    )

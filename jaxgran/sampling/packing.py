@@ -1,8 +1,9 @@
 """Random packings without overlap at a given packing fraction.
 
-The discs are slightly inflated. FIRE (Bitzek et al., Phys. Rev. Lett. 97, 170201, 2006) minimises their overlap energy
-½ Σ (overlap)² from random positions. Below jamming (0.8386 for this size distribution) the energy falls to zero. When
-the inflated discs overlap by less than the inflation, the true discs do not overlap.
+The discs are slightly inflated. FIRE (Bitzek et al., Phys. Rev. Lett. 97, 170201, 2006) minimises
+their overlap energy ½ Σ (overlap)² from random positions. Below jamming (0.8386 for this size
+distribution) the energy falls to zero. When the inflated discs overlap by less than the inflation,
+the true discs do not overlap.
 """
 
 from dataclasses import replace
@@ -52,21 +53,24 @@ class _Fire(NamedTuple):
     attempts: Array  # random starts so far
 
 
-def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[State, Bool[Array, ""]]:
+def pack(
+    flow: ShearFlow, key: Array, grains: Grains | None = None
+) -> tuple[State, Bool[Array, ""]]:
     """A random packing of discs at rest without overlap, and whether it was found.
 
     Args:
       flow: number of grains, polydispersity and packing fraction.
       key: JAX random key.
-      grains: given discs, in mean diameters, see ``own_grains``; None for those of ``polydisperse``.
+      grains: given discs, in mean diameters, see ``own_grains``; None for those of
+        ``polydisperse``.
 
     Returns:
-      The state, with zero velocities and no tilt, and whether one of ten random starts succeeded, as is expected up to
-      the largest accepted packing fraction, 0.83.
+      The state, with zero velocities and no tilt, and whether one of ten random starts succeeded,
+      as is expected up to the largest accepted packing fraction, 0.83.
 
     Raises:
-      InputError: (a ValueError) the number of grains is not that of the flow, their mean diameter is not 1, or a grain
-        is too large for the cell.
+      InputError: (a ValueError) the number of grains is not that of the flow, their mean diameter
+        is not 1, or a grain is too large for the cell.
     """
     require_flow(flow)
     require_key(key)
@@ -83,11 +87,16 @@ def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[Sta
     at_rest = jnp.zeros((flow.grains, 2), side.dtype)
 
     def start(attempt: Int[Array, ""]) -> _Fire:
-        positions = jax.random.uniform(jax.random.fold_in(place_key, attempt), at_rest.shape, side.dtype) * side
+        positions = (
+            jax.random.uniform(jax.random.fold_in(place_key, attempt), at_rest.shape, side.dtype)
+            * side
+        )
         neighbours = pair_lists(positions, inflated, side, jnp.zeros_like(side))
         step, mixing = jnp.asarray(_FIRST_STEP, side.dtype), jnp.asarray(0.1, side.dtype)
         overlap = jnp.full_like(side, jnp.inf)
-        return _Fire(neighbours, at_rest, step, mixing, jnp.int32(0), overlap, jnp.int32(0), attempt + 1)
+        return _Fire(
+            neighbours, at_rest, step, mixing, jnp.int32(0), overlap, jnp.int32(0), attempt + 1
+        )
 
     def unfinished(now: _Fire):
         return ~(now.overlap < allowed) & (now.attempts <= _ATTEMPTS)
@@ -95,12 +104,19 @@ def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[Sta
     def iterate(now: _Fire) -> _Fire:
         active = unfinished(now)
         stuck = active & (now.iterations >= _ITERATIONS)
-        now = lax.cond(any_replica(stuck), lambda: where_active(stuck, start(now.attempts), now), lambda: now)
+        now = lax.cond(
+            any_replica(stuck), lambda: where_active(stuck, start(now.attempts), now), lambda: now
+        )
         return where_active(active, _fire_step(now, inflated, side, allowed), now)
 
-    # the loop also makes the first start, so the search for pairs, half of this program, is compiled once
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(start, jnp.int32(0)))
-    before = nothing._replace(overlap=jnp.full_like(side, jnp.inf), iterations=jnp.int32(_ITERATIONS))
+    # the loop also makes the first start, so the search for pairs, half of this program, is
+    # compiled once
+    nothing = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(start, jnp.int32(0))
+    )
+    before = nothing._replace(
+        overlap=jnp.full_like(side, jnp.inf), iterations=jnp.int32(_ITERATIONS)
+    )
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), iterate, before)
     positions, tilt = present(end.neighbours, side)
     found = end.overlap < allowed
@@ -109,11 +125,13 @@ def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[Sta
 
 
 def require_room(flow: ShearFlow, grains: Grains) -> None:
-    """Raise an InputError unless the grains suit the flow and none is too large for the lists of near pairs.
+    """Raise an InputError unless the grains suit the flow and none is too large for the lists of
+    near pairs.
 
-    Nearest images are unique if the cell is at least two of the largest diameters wide. The search of more than 512
-    grains assumes similar sizes: the largest diameter may be 2.5 times the root mean square at ν = 0.83, and more at
-    smaller ν. Traced numbers are not checked here: ``pack`` then returns that no packing was found.
+    Nearest images are unique if the cell is at least two of the largest diameters wide. The search
+    of more than 512 grains assumes similar sizes: the largest diameter may be 2.5 times the root
+    mean square at ν = 0.83, and more at smaller ν. Traced numbers are not checked here: ``pack``
+    then returns that no packing was found.
     """
     require_grains(grains, flow.grains)
     if is_traced(grains.radii, flow.packing_fraction):
@@ -125,33 +143,42 @@ def require_room(flow: ShearFlow, grains: Grains) -> None:
     if room < _NARROWEST_SKIN:
         largest, typical = 2 * float(np.max(radii)), 2 * float(np.sqrt(np.mean(radii**2)))
         raise InputError(
-            f"the largest diameter must be at most {(largest + room - _NARROWEST_SKIN) / typical:.3g} times the root "
+            "the largest diameter must be at most "
+            f"{(largest + room - _NARROWEST_SKIN) / typical:.3g} times the root "
             f"mean square of all in a flow of {flow.grains} grains at packing fraction "
             f"{float(flow.packing_fraction):g}, not {largest / typical:.3g}."
         )
 
 
 def _overlap_forces(neighbours: PairLists) -> tuple[Float[Array, "grains 2"], Float[Array, ""]]:
-    """Forces of the overlap energy, and the largest overlap in σ, infinite if the list of pairs is incomplete."""
+    """Forces of the overlap energy, and the largest overlap in σ, infinite if the list of pairs is
+    incomplete.
+    """
     pairs = neighbours.near
     separations = separations_now(pairs, neighbours.frame)
     distances = jnp.maximum(jnp.sqrt(jnp.sum(separations**2, axis=-1)), 1e-6)
     overlaps = jnp.maximum(pairs.reach - distances, 0)
     forces = separations * (overlaps / distances)[:, None]
     largest = jnp.where(pairs.overflow, jnp.inf, jnp.max(overlaps))
-    return jnp.zeros_like(neighbours.positions).at[pairs.i].add(forces).at[pairs.j].add(-forces), largest
+    return jnp.zeros_like(neighbours.positions).at[pairs.i].add(forces).at[pairs.j].add(
+        -forces
+    ), largest
 
 
 def _fire_step(now: _Fire, grains: Grains, side: Array, allowed: Array) -> _Fire:
-    """One step of FIRE: the grains follow the forces with inertia, and stop when forces oppose velocities.
+    """One step of FIRE: the grains follow the forces with inertia, and stop when forces oppose
+    velocities.
 
-    If the overlap is already allowed, nothing moves: the returned packing is the one whose overlap was computed.
+    If the overlap is already allowed, nothing moves: the returned packing is the one whose overlap
+      was computed.
     """
     neighbours = now.neighbours
     used_skin = consumed_skin(neighbours.frame, neighbours.near_frame, 2 * jnp.max(grains.radii))
     stale = ~(used_skin <= neighbours.near.skin)
     neighbours = lax.cond(
-        any_replica(stale), lambda: refresh(now.neighbours, grains, side, stale), lambda: now.neighbours
+        any_replica(stale),
+        lambda: refresh(now.neighbours, grains, side, stale),
+        lambda: now.neighbours,
     )
     forces, overlap = _overlap_forces(neighbours)
     forward = jnp.sum(forces * now.velocities) > 0
@@ -160,13 +187,24 @@ def _fire_step(now: _Fire, grains: Grains, side: Array, allowed: Array) -> _Fire
     downhill = jnp.where(forward, now.downhill + 1, 0)
     accelerate = downhill > 5
     step = jnp.where(
-        forward, jnp.where(accelerate, jnp.minimum(now.step * 1.1, _LONGEST_STEP), now.step), now.step * 0.5
+        forward,
+        jnp.where(accelerate, jnp.minimum(now.step * 1.1, _LONGEST_STEP), now.step),
+        now.step * 0.5,
     )
     step = jnp.maximum(step, 1e-3)
-    mixing = jnp.where(forward, jnp.where(accelerate, now.mixing * 0.99, now.mixing), 0.1).astype(now.mixing.dtype)
+    mixing = jnp.where(forward, jnp.where(accelerate, now.mixing * 0.99, now.mixing), 0.1).astype(
+        now.mixing.dtype
+    )
     velocities = mixed + step * forces
     stride = jnp.where(overlap < allowed, 0, step)
     moved = Frame(neighbours.frame.displacements + stride * velocities, neighbours.frame.strain)
     return _Fire(
-        replace(neighbours, frame=moved), velocities, step, mixing, downhill, overlap, now.iterations + 1, now.attempts
+        replace(neighbours, frame=moved),
+        velocities,
+        step,
+        mixing,
+        downhill,
+        overlap,
+        now.iterations + 1,
+        now.attempts,
     )

@@ -28,20 +28,33 @@ def kinetic_theory(
 ) -> SteadyShear:
     """``gaussian_moments`` of many flows, (replicas,) each; not finite where α is 1.
 
-    Given grains (replicas, grains) are taken as a mixture of eight classes, sorted by diameter and then by mass.
+    Given grains (replicas, grains) are taken as a mixture of eight classes, sorted by diameter and
+    then by mass.
     """
     if grains is not None:
-        return jax.tree.map(np.asarray, _mixture_moments(restitution, packing_fraction, shear_rate, grains))
-    numbers = np.stack(np.broadcast_arrays(restitution, packing_fraction, shear_rate, polydispersity), axis=-1)
+        return jax.tree.map(
+            np.asarray, _mixture_moments(restitution, packing_fraction, shear_rate, grains)
+        )
+    numbers = np.stack(
+        np.broadcast_arrays(restitution, packing_fraction, shear_rate, polydispersity), axis=-1
+    )
     count = len(numbers)
-    filled = numbers[np.arange(-(-count // _TOGETHER) * _TOGETHER) % count].reshape(-1, _TOGETHER, 4)
+    filled = numbers[np.arange(-(-count // _TOGETHER) * _TOGETHER) % count].reshape(
+        -1, _TOGETHER, 4
+    )
     parts = [jax.tree.map(np.asarray, _gaussian_moments(part)) for part in filled]
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 
 def predicted(flow: ShearFlow, grains: Grains | None = None) -> SteadyShear:
-    """``kinetic_theory`` of every flow of a batch, with α at most 0.99, since T diverges at α = 1."""
-    numbers = np.minimum(flow.restitution, _LARGEST_RESTITUTION), flow.packing_fraction, flow.shear_rate
+    """``kinetic_theory`` of every flow of a batch, with α at most 0.99, since T diverges at α =
+    1.
+    """
+    numbers = (
+        np.minimum(flow.restitution, _LARGEST_RESTITUTION),
+        flow.packing_fraction,
+        flow.shear_rate,
+    )
     return kinetic_theory(*numbers, flow.polydispersity, grains)
 
 
@@ -51,14 +64,22 @@ def _gaussian_moments(numbers: Float[Array, "flows 4"]) -> SteadyShear:
 
 
 @persistent_jit
-def _mixture_moments(alpha: Array, packing_fraction: Array, shear_rate: Array, grains: Grains) -> SteadyShear:
-    return jax.vmap(mixture_moments)(alpha, packing_fraction, shear_rate, *jax.vmap(size_classes)(grains))
+def _mixture_moments(
+    alpha: Array, packing_fraction: Array, shear_rate: Array, grains: Grains
+) -> SteadyShear:
+    return jax.vmap(mixture_moments)(
+        alpha, packing_fraction, shear_rate, *jax.vmap(size_classes)(grains)
+    )
 
 
 def size_classes(grains: Grains) -> tuple[Float[Array, " classes"], Float[Array, " classes"]]:
-    """Mean diameters and masses of classes of equal numbers of grains, sorted by diameter and then by mass."""
+    """Mean diameters and masses of classes of equal numbers of grains, sorted by diameter and then
+    by mass.
+    """
     order = jnp.lexsort((grains.masses, grains.radii))
     edges = np.arange(_SIZE_CLASSES + 1) * order.size // _SIZE_CLASSES
     members = [order[first:last] for first, last in pairwise(edges)]
     diameters = jnp.stack([2 * jnp.mean(grains.radii[one]) for one in members])
-    return diameters / jnp.mean(diameters), jnp.stack([jnp.mean(grains.masses[one]) for one in members])
+    return diameters / jnp.mean(diameters), jnp.stack(
+        [jnp.mean(grains.masses[one]) for one in members]
+    )

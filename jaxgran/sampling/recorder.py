@@ -1,4 +1,6 @@
-"""Frames of a running flow: snapshots at equal intervals of strain, passed on when they are taken."""
+"""Frames of a running flow: snapshots at equal intervals of strain, passed on when they are
+taken.
+"""
 
 from collections.abc import Callable
 from functools import partial, reduce
@@ -17,22 +19,25 @@ from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.batch import AdvanceBatch
 
-Keep = Callable[[Snapshot, int], None]  # called with a frame and the number of time steps since the first frame
+Keep = Callable[
+    [Snapshot, int], None
+]  # called with a frame and the number of time steps since the first frame
 
 
 class Recorder:
     """Takes frames of a replica while it is advanced.
 
-    Frames are taken at the start and then at multiples of a strain, each at the nearest time step. If a frame falls
-    inside an advance, it is split, and the sums differ by rounding. In a flow of many collisions, rounding leads to
-    another trajectory of the same flow. If all frames fall on the ends of advances, all results are the same bit for
-    bit.
+    Frames are taken at the start and then at multiples of a strain, each at the nearest time step.
+    If a frame falls inside an advance, it is split, and the sums differ by rounding. In a flow of
+    many collisions, rounding leads to another trajectory of the same flow. If all frames fall on
+    the ends of advances, all results are the same bit for bit.
 
     Args:
       every: strain from frame to frame; frames are at least a time step apart.
       keep: functions that are called with every frame.
-      force_strain: strain from each frame on in which a copy of the flow is advanced step by step. The frame is then
-        the series of these snapshots, which begins at the frame. One time step or less for a single snapshot.
+      force_strain: strain from each frame on in which a copy of the flow is advanced step by step.
+        The frame is then the series of these snapshots, which begins at the frame. One time step or
+        less for a single snapshot.
     """
 
     def __init__(self, every: float, *keep: Keep, force_strain: float = 0.0):
@@ -40,7 +45,9 @@ class Recorder:
         self.frames = self.steps = self._taken = 0
 
     def recording(self, advance: AdvanceBatch) -> AdvanceBatch:
-        """The advance of a batch of one replica, recording frames; the first call starts a new series."""
+        """The advance of a batch of one replica, recording frames; the first call starts a new
+        series.
+        """
         self.frames = self.steps = self._taken = 0
         return partial(self._advance, advance)
 

@@ -1,4 +1,6 @@
-"""Sample: sums over a strain of a flow, kept in blocks, and the averages with errors that follow from them."""
+"""Sample: sums over a strain of a flow, kept in blocks, and the averages with errors that follow
+from them.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -35,14 +37,24 @@ from jaxgran.sampling.averages import averages
 from jaxgran.sampling.correlation_strain import flow_correlation_strain, length_status
 from jaxgran.sampling.observables import OBSERVABLES, Averages
 from jaxgran.sampling.observe import Observable, advance_and_observe
-from jaxgran.statistics import Estimates, correlation_length, error_correlation, merged_blocks, standard_errors
+from jaxgran.statistics import (
+    Estimates,
+    correlation_length,
+    error_correlation,
+    merged_blocks,
+    standard_errors,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
 
 BLOCKS = 32
 MOST_BLOCKS = 10**6
-ERROR_OBSERVABLES = ("force_ratio", "pressure", "shear_stress")  # a target for the relative error holds for these
+ERROR_OBSERVABLES = (
+    "force_ratio",
+    "pressure",
+    "shear_stress",
+)  # a target for the relative error holds for these
 _SMALLEST_MOTION = 20  # of a grain at velocity γ̇σ in one step, in roundings of a position
 
 _SHOWN = (
@@ -81,10 +93,11 @@ class Sample(Averages, Indexable):
     grains      static     –     number of grains
     ==========  =========  ====  =================================================
 
-    Every observable is an attribute, such as ``sample.pressure``: the average over all blocks, in units of m, σ and the
-    time unit t of the shear rate (1/γ̇ at the default γ̇ = 1). ``averages`` has all of them by name, and ``errors()``
-    their standard errors. They are NumPy numbers, and JAX arrays only where JAX traces the sample. ``sample[0]`` is the
-    sample of the first replica of a batch.
+    Every observable is an attribute, such as ``sample.pressure``: the average over all blocks, in
+    units of m, σ and the time unit t of the shear rate (1/γ̇ at the default γ̇ = 1). ``averages``
+    has all of them by name, and ``errors()`` their standard errors. They are NumPy numbers, and JAX
+    arrays only where JAX traces the sample. ``sample[0]`` is the sample of the first replica of a
+    batch.
     """
 
     tally: Tally
@@ -113,12 +126,16 @@ class Sample(Averages, Indexable):
 
     @property
     def status(self) -> Int[Array | np.ndarray, "*replicas"]:
-        """The worst status, see ``Tally.outcome``; ``short_sample`` below four correlation strains."""
+        """The worst status, see ``Tally.outcome``; ``short_sample`` below four correlation
+        strains.
+        """
         return self._total.outcome
 
     @property
     def observed_sums(self) -> Any:
-        """Sums over the steps of each block of what ``observe`` returns, a pytree; None without ``observe``."""
+        """Sums over the steps of each block of what ``observe`` returns, a pytree; None without
+        ``observe``.
+        """
         return self.tally.observed
 
     @property
@@ -141,14 +158,17 @@ class Sample(Averages, Indexable):
         return {name: np.stack([errors[name] for errors in each]) for name in each[0]}
 
     def to_dataset(self) -> "xr.Dataset":
-        """The averages as an ``xarray.Dataset``, named as in a map: NAME, NAME_stderr, and the strain and the status.
+        """The averages as an ``xarray.Dataset``, named as in a map: NAME, NAME_stderr, and the
+        strain and the status.
 
-        A batch has the dimension ``replica``, and tensors have ``axis_a`` and ``axis_b``. ``long_name`` says what a
-        variable is. ``reduced_unit`` is its unit in m, σ and t. If ``observe`` returned a dictionary of numbers or
-        arrays, their means are there too; an array has the dimensions NAME_dim_0, NAME_dim_1, …
+        A batch has the dimension ``replica``, and tensors have ``axis_a`` and ``axis_b``.
+        ``long_name`` says what a variable is. ``reduced_unit`` is its unit in m, σ and t. If
+        ``observe`` returned a dictionary of numbers or arrays, their means are there too; an array
+        has the dimensions NAME_dim_0, NAME_dim_1, …
 
         Raises:
-          InputError: JAX transforms this function, or ``observe`` returned a name that an average has.
+          InputError: JAX transforms this function, or ``observe`` returned a name that an average
+            has.
         """
         require_untraced("to_dataset()", "take it of the finished sample", self)
         from jaxgran.sampling.sample_dataset import dataset_of
@@ -156,22 +176,29 @@ class Sample(Averages, Indexable):
         return dataset_of(self)
 
     def observed(self, estimate: Callable[[Any], Any] = lambda means: means) -> tuple[Any, Any]:
-        """Means over all time steps of what ``observe`` returned, and their standard errors, for one replica.
+        """Means over all time steps of what ``observe`` returned, and their standard errors, for
+        one replica.
 
         Args:
-          estimate: a function of the means, such as a ratio of two of them. The errors are those of its result, see
-            ``standard_errors``.
+          estimate: a function of the means, such as a ratio of two of them. The errors are those of
+            its result, see ``standard_errors``.
 
         Returns:
           Values and errors, two pytrees of the form that ``estimate`` returns.
 
         Raises:
-          InputError: the sample was made without ``observe``, or it holds a batch, or JAX transforms this function.
+          InputError: the sample was made without ``observe``, or it holds a batch, or JAX
+            transforms this function.
         """
         if self.observed_sums is None:
-            raise InputError("observed() needs a sample that was made with observe=, and this one was made without.")
+            raise InputError(
+                "observed() needs a sample that was made with observe=, and this one was made "
+                "without."
+            )
         if np.ndim(self.area):
-            raise InputError("observed() needs the sample of one replica, such as sample[0] of this batch.")
+            raise InputError(
+                "observed() needs the sample of one replica, such as sample[0] of this batch."
+            )
         require_untraced("observed()", "take it of the finished sample", self)
 
         return observed_estimates([self], estimate)
@@ -200,8 +227,8 @@ def observed_estimates(
 def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
     """Averages over all blocks of several replicas of one flow, and their ``standard_errors``.
 
-    For an extreme, such as the largest overlap, the value is the largest of all blocks. Its error is the standard
-    deviation over the blocks.
+    For an extreme, such as the largest overlap, the value is the largest of all blocks. Its error
+    is the standard deviation over the blocks.
     """
     average, sums = _stacked(seeds)
     values, errors = standard_errors(average, sums, durations(seeds))
@@ -213,25 +240,32 @@ def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
 
 
 def relative_error(measured: Sample) -> float:
-    """The largest relative standard error of ``ERROR_OBSERVABLES`` of one replica; infinite if one is not known."""
+    """The largest relative standard error of ``ERROR_OBSERVABLES`` of one replica; infinite if one
+    is not known.
+    """
     values, errors = estimates([measured])
     with np.errstate(invalid="ignore", divide="ignore"):
-        worst = max(np.nan_to_num(errors[x] / abs(values[x]), nan=np.inf) for x in ERROR_OBSERVABLES)
+        worst = max(
+            np.nan_to_num(errors[x] / abs(values[x]), nan=np.inf) for x in ERROR_OBSERVABLES
+        )
     return float(worst)
 
 
 def correlation_strains(seeds: Sequence[Sample]) -> Estimates:
     """Strain of one independent sample, for every average over replicas of one flow.
 
-    The sampled strain of all replicas over this strain is the effective sample size. A correlation shorter than a block
-    of the longest replica cannot be resolved: the result is then the strain of this block.
+    The sampled strain of all replicas over this strain is the effective sample size. A correlation
+    shorter than a block of the longest replica cannot be resolved: the result is then the strain of
+    this block.
     """
     average, sums = _stacked(seeds)
     strains = durations(seeds)
     lengths = correlation_length(average, sums, strains)
     count = merged_blocks(strains, *sums.duration.shape).sum()
     block = np.sum(sums.duration) / count * np.asarray(seeds[0].shear_rate)
-    return {name: length * block for name, length in lengths.items() if not OBSERVABLES[name].extreme}
+    return {
+        name: length * block for name, length in lengths.items() if not OBSERVABLES[name].extreme
+    }
 
 
 def error_correlation_of(seeds: Sequence[Sample], first: str, second: str) -> float:
@@ -251,10 +285,16 @@ def durations(seeds: Sequence[Sample]) -> np.ndarray:
 
 
 def _stacked(seeds: Sequence[Sample]) -> tuple[Callable[[Tally], dict[str, Array]], Tally]:
-    """The averages as a function of sums, and the sums (seeds, blocks, ...) of the replicas of one flow."""
+    """The averages as a function of sums, and the sums (seeds, blocks, ...) of the replicas of one
+    flow.
+    """
     first = seeds[0]
-    sums = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *(seed.tally for seed in seeds))
-    return partial(averages, area=first.area, grains=first.grains, shear_rate=first.shear_rate), sums
+    sums = jax.tree.map(
+        lambda *x: np.stack([np.asarray(one) for one in x]), *(seed.tally for seed in seeds)
+    )
+    return partial(
+        averages, area=first.area, grains=first.grains, shear_rate=first.shear_rate
+    ), sums
 
 
 def sample(
@@ -268,45 +308,54 @@ def sample(
     solver: ProjectedMethod = DEFAULT_SOLVER,
     engine: Engine | None = None,
 ) -> tuple[State, Sample]:
-    """Shear a flow, or a batch of flows, and average its observables; ``jit``, ``vmap`` and ``lax.map`` apply.
+    """Shear a flow, or a batch of flows, and average its observables; ``jit``, ``vmap`` and
+    ``lax.map`` apply.
 
-    A batch is a flow or a state whose arrays have a leading (replicas,) axis; what lacks it is the same for all. Each
-    replica has the results of its own call. ``jax.vmap`` of this function does the same. A batch is faster with the
-    engine ``Jax``, and is compiled for 1, 2, 4, 8, … replicas only.
+    A batch is a flow or a state whose arrays have a leading (replicas,) axis; what lacks it is the
+    same for all. Each replica has the results of its own call. ``jax.vmap`` of this function does
+    the same. A batch is faster with the engine ``Jax``, and is compiled for 1, 2, 4, 8, … replicas
+    only.
 
-    The numba engine takes all blocks in one call, unless there is ``observe`` or ``callback``. Then every block begins
-    with a new list of near pairs, and its trajectory differs by rounding, which grows as in any chaotic flow.
+    The numba engine takes all blocks in one call, unless there is ``observe`` or ``callback``. Then
+    every block begins with a new list of near pairs, and its trajectory differs by rounding, which
+    grows as in any chaotic flow.
 
-    The result of ``observe`` is averaged over **every** time step, in the same run (see ``observer``). A few instants
-    do not suffice for contact forces: at a short time step, most instants of a collisional flow have no contact with a
-    force. A function of the forces, which are ``impulses / timestep``, is averaged exactly. Positions and velocities
-    are observed once a free flight; their averages are accurate up to the strain of a flight, about 1e-3.
+    The result of ``observe`` is averaged over **every** time step, in the same run (see
+    ``observer``). A few instants do not suffice for contact forces: at a short time step, most
+    instants of a collisional flow have no contact with a force. A function of the forces, which are
+    ``impulses / timestep``, is averaged exactly. Positions and velocities are observed once a free
+    flight; their averages are accurate up to the strain of a flight, about 1e-3.
 
     Args:
-      flow: parameters of the state, with its packing fraction and polydispersity; or those (replicas,) of a batch.
+      flow: parameters of the state, with its packing fraction and polydispersity; or those
+        (replicas,) of a batch.
       state: the flow at the beginning, usually from ``prepare``; or a batch of states.
-      strain: strain γ̇t to sample, rounded to whole time steps; for a batch also (replicas,). A new value does not
-        recompile.
+      strain: strain γ̇t to sample, rounded to whole time steps; for a batch also (replicas,). A new
+        value does not recompile.
       blocks: number of equal parts of the strain, static; a tally is kept for each.
-      observe: a function of a ``Snapshot`` that returns a pytree of arrays to average. It is static: each new function,
-        such as a lambda that is written anew, is compiled, so define it once. Beside the numba engine this takes about
-        2 s. Where the engine ``Jax`` runs, or the function uses values from outside that JAX traces, that engine is
-        compiled with it, in about 20 s. The next process loads the program.
-        The contacts are those of a step with an approaching contact, before the impulses act; other steps have none.
-        The size of their buffers varies, so ``observe`` must return sums over contacts or over grains.
-      callback: called after each block with the state and the sample so far; if its result is true, the sample ends.
-        One block is then compiled at a time, and neither batches nor JAX transformations apply.
-      solver: solves the contacts of each step, by default ``BarzilaiBorwein()``. New numbers in it do not recompile.
+      observe: a function of a ``Snapshot`` that returns a pytree of arrays to average. It is
+        static: each new function, such as a lambda that is written anew, is compiled, so define it
+        once. Beside the numba engine this takes about 2 s. Where the engine ``Jax`` runs, or the
+        function uses values from outside that JAX traces, that engine is compiled with it, in about
+        20 s. The next process loads the program. The contacts are those of a step with an
+        approaching contact, before the impulses act; other steps have none. The size of their
+        buffers varies, so ``observe`` must return sums over contacts or over grains.
+      callback: called after each block with the state and the sample so far; if its result is true,
+        the sample ends. One block is then compiled at a time, and neither batches nor JAX
+        transformations apply.
+      solver: solves the contacts of each step, by default ``BarzilaiBorwein()``. New numbers in it
+        do not recompile.
       engine: ``Jax()`` or ``Numba()``; None for the fastest that can do this, see ``advance``.
 
     Returns:
       The final state and the sample; those of a batch have a leading (replicas,) axis.
 
     Raises:
-      InputError: (a ValueError) the axes of a batch differ; the state has another packing fraction or polydispersity
-        than the flow; the flow is not sheared; the strain is not a positive number, is shorter than one time step a
-        block, or is longer than 2**31 - 1 time steps; positions in float32 cannot resolve the time step; the result of
-        ``observe`` is not summed over contacts; or the engine cannot do this.
+      InputError: (a ValueError) the axes of a batch differ; the state has another packing fraction
+        or polydispersity than the flow; the flow is not sheared; the strain is not a positive
+        number, is shorter than one time step a block, or is longer than 2**31 - 1 time steps;
+        positions in float32 cannot resolve the time step; the result of ``observe`` is not summed
+        over contacts; or the engine cannot do this.
 
     Examples:
       The fabric of the contacts that carry a force:
@@ -317,7 +366,8 @@ def sample(
       >>> def observe(snapshot):
       ...     normals = snapshot.contacts.normals
       ...     loaded = (snapshot.impulses > 0).astype(normals.dtype)
-      ...     return {"fabric": jnp.einsum("c,ca,cb->ab", loaded, normals, normals), "contacts": jnp.sum(loaded)}
+      ...     fabric = jnp.einsum("c,ca,cb->ab", loaded, normals, normals)
+      ...     return {"fabric": fabric, "contacts": jnp.sum(loaded)}
       >>> state, measured = sample(flow, state, 0.4, observe=observe)
       >>> fabric, error = measured.observed(lambda mean: mean["fabric"] / mean["contacts"])
       >>> round(float(fabric.trace()), 6), bool(measured.errors()["pressure"] > 0)
@@ -338,8 +388,12 @@ def sample(
         program = partial(compiled_over_replicas, _sample, (blocks, observe), option, numerics)
         return compiled_for_few_sizes(program, numerics, batch)
     if batch or is_traced(flow, numerics, state, strain):
-        raise InputError("callback must be None for a batch, and where a sample is transformed, as by jax.jit.")
-    return _sample_with_callback(flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe, callback)
+        raise InputError(
+            "callback must be None for a batch, and where a sample is transformed, as by jax.jit."
+        )
+    return _sample_with_callback(
+        flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe, callback
+    )
 
 
 def _require_sheared_state(blocks: int, flow: ShearFlow, state: State, strain: Any) -> None:
@@ -352,9 +406,16 @@ def _require_sheared_state(blocks: int, flow: ShearFlow, state: State, strain: A
 
 @partial(jax.jit, static_argnames=("blocks", "observe"))
 def _sample(
-    flow: ShearFlow, numerics: Numerics, state: State, strain: Array, blocks: int, observe: Observable | None = None
+    flow: ShearFlow,
+    numerics: Numerics,
+    state: State,
+    strain: Array,
+    blocks: int,
+    observe: Observable | None = None,
 ) -> tuple[State, Sample]:
-    end, measured = _sample_blocks(flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe)
+    end, measured = _sample_blocks(
+        flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe
+    )
     return end, _with_length(measured, end)
 
 
@@ -363,7 +424,11 @@ def _steps_of_blocks(flow: ShearFlow, strain: float | Array, blocks: int) -> Int
 
 
 def _sample_blocks(
-    flow: ShearFlow, numerics: Numerics, state: State, steps: Int[Array, " blocks"], observe: Observable | None
+    flow: ShearFlow,
+    numerics: Numerics,
+    state: State,
+    steps: Int[Array, " blocks"],
+    observe: Observable | None,
 ) -> tuple[State, Sample]:
     """The final state and the sample of blocks with the given numbers of time steps."""
 
@@ -401,31 +466,39 @@ def _sample_with_callback(
 
 
 def _with_length(measured: Sample, state: State) -> Sample:
-    """The sample with the status ``short_sample`` in its last block where it is short, see ``correlation_strain``."""
+    """The sample with the status ``short_sample`` in its last block where it is short, see
+    ``correlation_strain``.
+    """
     tally, grains = measured.tally, measured.grains
     total = averages(tally.total(axis=0), measured.area, grains, measured.shear_rate)
     mass = jnp.sum(state.grains.masses)
     correlation = flow_correlation_strain(total, grains, mass, measured.area, measured.shear_rate)
     status = length_status(jnp.sum(tally.duration) * measured.shear_rate, correlation)
     last = jnp.maximum(tally.status[-1], jnp.asarray(status, tally.status.dtype))
-    return replace(measured, tally=replace(tally, status=jnp.asarray(tally.status).at[-1].set(last)))
+    return replace(
+        measured, tally=replace(tally, status=jnp.asarray(tally.status).at[-1].set(last))
+    )
 
 
 def _joined(parts: list[Sample]) -> Sample:
     """One sample from successive samples of the same flow."""
     tallies = (part.tally for part in parts)
-    tally = jax.tree.map(lambda *x: jnp.asarray(np.concatenate([np.asarray(one) for one in x])), *tallies)
+    tally = jax.tree.map(
+        lambda *x: jnp.asarray(np.concatenate([np.asarray(one) for one in x])), *tallies
+    )
     return replace(parts[-1], tally=tally)
 
 
 def check_precision(flow: ShearFlow, state: State) -> None:
     """Raise an InputError if positions cannot resolve the time step; traced values are not checked.
 
-    In one step a grain at velocity γ̇σ moves by γ̇ dt σ. In float32 a position in a cell of 20 σ is rounded to 2e-6 σ.
+    In one step a grain at velocity γ̇σ moves by γ̇ dt σ. In float32 a position in a cell of 20 σ is
+    rounded to 2e-6 σ.
 
-    The engines add the motion to displacements since the last build of the lists, which are far smaller. So a flow is
-    wrong only if a step moves a pair by less than the rounding of its separation, 1e-7 σ. But summed times drift by
-    1e-3, and programs that compare the positions of two states see their rounding. So the limit is that of positions.
+    The engines add the motion to displacements since the last build of the lists, which are far
+    smaller. So a flow is wrong only if a step moves a pair by less than the rounding of its
+    separation, 1e-7 σ. But summed times drift by 1e-3, and programs that compare the positions of
+    two states see their rounding. So the limit is that of positions.
     """
     if is_traced(flow.timestep, flow.shear_rate, state.side):
         return

@@ -24,28 +24,44 @@ def dataset_of(sample: "Sample") -> xr.Dataset:
         dims = (*replicas, *one.axes)
         variables[name] = dims, values[name], _about(one.meaning, one.unit)
         variables[f"{name}_stderr"] = dims, errors[name], _about(one.meaning_of_error, one.unit)
-    flags = {"flag_values": np.array([*Status], np.int8), "flag_meanings": " ".join(status.name for status in Status)}
+    flags = {
+        "flag_values": np.array([*Status], np.int8),
+        "flag_meanings": " ".join(status.name for status in Status),
+    }
     variables["strain"] = replicas, sample.strain, _about("sampled strain", "1")
-    variables["status"] = replicas, np.asarray(sample.status, np.int8), {"long_name": "status", **flags}
+    variables["status"] = (
+        replicas,
+        np.asarray(sample.status, np.int8),
+        {"long_name": "status", **flags},
+    )
     own = _own_variables(sample, replicas)
     if taken := [name for name in own if name in variables]:
-        raise InputError(f"observe must return names that a sample does not have, not {short_repr(taken[0])}.")
+        raise InputError(
+            f"observe must return names that a sample does not have, not {short_repr(taken[0])}."
+        )
     variables |= own
     coordinates = {axis: ["x", "y"] for axis in TENSOR_AXES}
     return xr.Dataset(variables, coordinates, {"grains": sample.grains})
 
 
 def _own_variables(sample: "Sample", replicas: tuple[str, ...]) -> dict[str, Any]:
-    """The means of what ``observe`` returned, with errors, if it is a dictionary of numbers or arrays."""
+    """The means of what ``observe`` returned, with errors, if it is a dictionary of numbers or
+    arrays.
+    """
     sums = sample.observed_sums
-    if not isinstance(sums, dict) or not all(isinstance(x, (np.ndarray, jax.Array)) for x in sums.values()):
+    if not isinstance(sums, dict) or not all(
+        isinstance(x, (np.ndarray, jax.Array)) for x in sums.values()
+    ):
         return {}
     each = [sample[k].observed() for k in range(len(sample))] if replicas else [sample.observed()]
     variables = {}
     for name in sums:
         means, errors = (np.stack([one[kind][name] for one in each]) for kind in (0, 1))
         dims = (*replicas, *dimensions_of(name, means.shape[1:]))
-        for key, numbers, meaning in ((name, means, "mean"), (f"{name}_stderr", errors, "standard error of the mean")):
+        for key, numbers, meaning in (
+            (name, means, "mean"),
+            (f"{name}_stderr", errors, "standard error of the mean"),
+        ):
             values = numbers if replicas else numbers[0]
             variables[key] = dims, values, {"long_name": f"{meaning} of {name} over all time steps"}
     return variables

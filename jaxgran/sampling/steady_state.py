@@ -1,20 +1,23 @@
 """Steps of one simulation: pack, heat, shear to the steady state, shorten the time step, sample.
 
-The stresses hardly depend on the time step, but the force ratio does. After a change of the time step, the contact
-network needs a strain of up to 0.5 to adapt. So the flow is sheared to its steady state at a coarse time step. The step
-is then shortened geometrically. At the final step the network relaxes over a strain of 0.5 before the sample begins.
+The stresses hardly depend on the time step, but the force ratio does. After a change of the time
+step, the contact network needs a strain of up to 0.5 to adapt. So the flow is sheared to its steady
+state at a coarse time step. The step is then shortened geometrically. At the final step the network
+relaxes over a strain of 0.5 before the sample begins.
 
-The test for a steady state is statistical. The flow is sheared in chunks, and the temperature T and pressure P of each
-chunk are recorded. The last two thirds of the record are split into halves. The means of ln T in the two halves must
-differ by less than twice the standard error of their difference, or by less than 0.1, and this error must be at most
-0.1. The same holds for ln P. In this error, chunks are correlated over at least the correlation strain of the flow.
-Small systems fluctuate more, so a flow that is undecided after the last chunk still counts as steady if the means
+The test for a steady state is statistical. The flow is sheared in chunks, and the temperature T and
+pressure P of each chunk are recorded. The last two thirds of the record are split into halves. The
+means of ln T in the two halves must differ by less than twice the standard error of their
+difference, or by less than 0.1, and this error must be at most 0.1. The same holds for ln P. In
+this error, chunks are correlated over at least the correlation strain of the flow. Small systems
+fluctuate more, so a flow that is undecided after the last chunk still counts as steady if the means
 differ by less than four standard errors of the noise about a linear trend.
 
-A chunk lasts a quarter of the correlation strain, which is measured in the first chunks. So the preparation takes at
-least three correlation strains. A sample lasts six, unless its strain is given; below four its status is
-``short_sample``. A sample that ends when its estimated error is small lasts at least twice as long: of shorter ones, it
-would select those that underestimate their error.
+A chunk lasts a quarter of the correlation strain, which is measured in the first chunks. So the
+preparation takes at least three correlation strains. A sample lasts six, unless its strain is
+given; below four its status is ``short_sample``. A sample that ends when its estimated error is
+small lasts at least twice as long: of shorter ones, it would select those that underestimate their
+error.
 """
 
 from collections.abc import Mapping
@@ -29,9 +32,22 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
-from jaxgran.dynamics.engine import DEFAULT_NUMERICS, Engine, Numerics, checked_numerics, in_lockstep
+from jaxgran.dynamics.engine import (
+    DEFAULT_NUMERICS,
+    Engine,
+    Numerics,
+    checked_numerics,
+    in_lockstep,
+)
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.checks import InputError, is_traced, key_shape, require, require_key, require_number
+from jaxgran.model.checks import (
+    InputError,
+    is_traced,
+    key_shape,
+    require,
+    require_key,
+    require_number,
+)
 from jaxgran.model.flow import ShearFlow, one_of, require_sheared, steps_of_blocks, steps_of_strain
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
@@ -73,10 +89,13 @@ _MEASURING_CHUNKS = 4  # which set the length of later chunks; the test leaves t
 _MOST_CHUNKS = 60  # before the flow counts as not steady
 _LARGEST_STEADY_RATIO = 2.0  # drift over its standard error, below which it is noise
 _LARGEST_STEADY_DRIFT = 0.1  # in ln T and ln P; a smaller drift is accepted
-_LARGEST_STEADY_ERROR = 0.1  # of the drift, in ln T and ln P; above it the test is undecided until the last chunk
+_LARGEST_STEADY_ERROR = (
+    0.1  # of the drift, in ln T and ln P; above it the test is undecided until the last chunk
+)
 _LARGEST_LAST_RATIO = 4.0  # of the drift over the error of the noise, after the last chunk
 _UNCOMPILED = (
-    "{} cannot be transformed by jax.jit, jax.vmap or jax.grad, since it decides in Python: call it before, with a "
+    "{} cannot be transformed by jax.jit, jax.vmap or jax.grad, since it decides in Python: call "
+    "it before, with a "
     "batch of keys for many states, and pass its state to what is transformed."
 )
 
@@ -108,20 +127,22 @@ def prepare(
     Args:
       flow: parameters of one flow; or numbers (replicas,) of several flows.
       key: JAX random key; the same key gives the same state. Keys (replicas,) prepare a batch.
-      equilibrate: strain at the coarse time step, or None to shear until the flow is steady. A given strain is not
-        checked here. A map gives the status ``not_steady`` if it is shorter than the correlation strain of the flow.
-      grains: given discs, see ``own_grains``, those of all replicas or with a leading (replicas,) axis; None for
-        diameters uniform in σ ± ``polydispersity``.
+      equilibrate: strain at the coarse time step, or None to shear until the flow is steady. A
+        given strain is not checked here. A map gives the status ``not_steady`` if it is shorter
+        than the correlation strain of the flow.
+      grains: given discs, see ``own_grains``, those of all replicas or with a leading (replicas,)
+        axis; None for diameters uniform in σ ± ``polydispersity``.
       solver, engine: as in ``sample``, for all replicas.
 
     Returns:
-      The state after packing, heating, shearing and relaxing; that of a batch has a leading (replicas,) axis.
+      The state after packing, heating, shearing and relaxing; that of a batch has a leading
+      (replicas,) axis.
 
     Raises:
-      InputError: (a ValueError) the flow is not sheared, a grain of thermal speed would cross more than a tenth of a
-        diameter in one step, float32 positions cannot resolve the step, ``pack`` does not accept the grains, or the
-        engine cannot do this. Or this function, which decides in Python when a flow is steady, is called within
-        ``jax.jit``, ``jax.vmap`` or a derivative.
+      InputError: (a ValueError) the flow is not sheared, a grain of thermal speed would cross more
+        than a tenth of a diameter in one step, float32 positions cannot resolve the step, ``pack``
+        does not accept the grains, or the engine cannot do this. Or this function, which decides in
+        Python when a flow is steady, is called within ``jax.jit``, ``jax.vmap`` or a derivative.
       RuntimeError: the flow, or one of the batch, did not become steady or ended with a bad status.
 
     Examples:
@@ -138,11 +159,17 @@ def prepare(
         require_number("equilibrate", equilibrate, lambda x: (x >= 0) & (x <= 1e6), words)
     require_sheared(flow)
     numerics = checked_numerics(solver, engine)
-    batch = prepare_batch(flows, keys, equilibrate, advance_on_all_cores, grains=discs, numerics=numerics)
+    batch = prepare_batch(
+        flows, keys, equilibrate, advance_on_all_cores, grains=discs, numerics=numerics
+    )
     tolerated = Status.ok if equilibrate is None else Status.not_steady
     if single and batch.status[0] > tolerated:
         raise RuntimeError(f"the flow could not be prepared: {Status(batch.status[0]).name}.")
-    failed = [f"{k} ({Status(status).name})" for k, status in enumerate(batch.status) if status > tolerated]
+    failed = [
+        f"{k} ({Status(status).name})"
+        for k, status in enumerate(batch.status)
+        if status > tolerated
+    ]
     if failed:
         raise RuntimeError(f"not all replicas could be prepared: {', '.join(failed)}.")
     return jax.tree.map(lambda x: jnp.asarray(x[0] if single else x), batch.state)
@@ -162,13 +189,17 @@ def prepare_batch(
     """
     theory = predicted(flow, grains)
     check_timestep(flow, theory, grains)
-    expected = expected_temperature(theory.granular_temperature, flow.packing_fraction, flow.shear_rate)
+    expected = expected_temperature(
+        theory.granular_temperature, flow.packing_fraction, flow.shear_rate
+    )
     temperature = expected.astype(theory.granular_temperature.dtype)
     state, packed = _heated(flow, keys, temperature, grains, lockstep=in_lockstep())
     check_precision(flow, state)
     status = np.where(np.asarray(packed), Status.ok, Status.infeasible)
     coarse = replace(flow, timestep=bounded_coarse_timestep(flow, theory, grains))
-    predictions = {name: getattr(theory, name) for name in ("granular_temperature", "pressure", "shear_stress")}
+    predictions = {
+        name: getattr(theory, name) for name in ("granular_temperature", "pressure", "shear_stress")
+    }
     each = for_replicas(numerics, len(status))
     batch = Batch(coarse, each, state, status, np.zeros(len(status)), np.zeros(len(status)))
     batch = batch._replace(correlation_strain=_correlation_strain(batch, predictions))
@@ -178,12 +209,17 @@ def prepare_batch(
         batch = _sheared(batch, np.full(len(status), equilibrate), advance, measure=True)
     if equilibrate is not None:
         too_short = equilibrate < batch.correlation_strain
-        batch = batch._replace(status=np.maximum(batch.status, np.where(too_short, Status.not_steady, Status.ok)))
+        batch = batch._replace(
+            status=np.maximum(batch.status, np.where(too_short, Status.not_steady, Status.ok))
+        )
     return _shortened(batch, flow, advance)
 
 
 def sample_batch(
-    batch: Batch, strain: float | None, advance: AdvanceBatch = advance_batch, error: float | None = None
+    batch: Batch,
+    strain: float | None,
+    advance: AdvanceBatch = advance_batch,
+    error: float | None = None,
 ) -> tuple[Batch, Sample]:
     """Sample every replica of a batch in blocks whose numbers of time steps differ by one at most.
 
@@ -191,9 +227,10 @@ def sample_batch(
       batch: prepared replicas.
       strain: strain to sample, or None for six correlation strains of each flow, at least 8.
       advance: advances the batch.
-      error: target for the relative standard error of each of ``ERROR_OBSERVABLES``. The strain of a replica begins
-        with twice the one without a target, and is doubled until the target is reached, up to ``LONGEST_STRAIN`` or 32
-        correlation strains, where its status is ``strain_limit``. None samples ``strain`` only.
+      error: target for the relative standard error of each of ``ERROR_OBSERVABLES``. The strain of
+        a replica begins with twice the one without a target, and is doubled until the target is
+        reached, up to ``LONGEST_STRAIN`` or 32 correlation strains, where its status is
+        ``strain_limit``. None samples ``strain`` only.
     """
     strains = (
         np.maximum(LEAST_SAMPLE, SAMPLE_CORRELATION_STRAINS * batch.correlation_strain)
@@ -214,27 +251,36 @@ def sample_batch(
         strains = np.where(extended, 2 * strains, strains)
         tally = jax.tree.map(partial(_where_replica, extended), _doubled(tally, more), tally)
     sample = _as_sample(batch, tally)
-    batch = batch._replace(correlation_strain=_correlation_strain(batch, _averages(batch, sample._total)))
+    batch = batch._replace(
+        correlation_strain=_correlation_strain(batch, _averages(batch, sample._total))
+    )
     of_length = length_status(strains, batch.correlation_strain)
     of_error = np.where(imprecise, Status.strain_limit, Status.ok)
-    return batch._replace(status=np.maximum.reduce([batch.status, of_length, of_error, sample.status])), sample
+    return batch._replace(
+        status=np.maximum.reduce([batch.status, of_length, of_error, sample.status])
+    ), sample
 
 
-def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains | None = None) -> State:
-    """A random packing with Gaussian velocities of a given granular temperature; or many of them at once.
+def heated(
+    flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains | None = None
+) -> State:
+    """A random packing with Gaussian velocities of a given granular temperature; or many of them at
+    once.
 
     It is the start of a free cooling, or of a flow that the user equilibrates.
 
     Args:
       flow: parameters of one flow, sheared or not; or numbers (replicas,) of several flows.
-      key: JAX random key; the same key gives the same state. Keys (replicas,) make a batch, as in ``prepare``.
-      temperature: exact value of Σ m c²/(2N), in mσ²/t², of all replicas or (replicas,). Grains of every mass have this
-        temperature on average. The total momentum is zero.
-      grains: given discs, see ``own_grains`` and ``prepare``; None for diameters uniform in σ ± ``polydispersity``.
+      key: JAX random key; the same key gives the same state. Keys (replicas,) make a batch, as in
+        ``prepare``.
+      temperature: exact value of Σ m c²/(2N), in mσ²/t², of all replicas or (replicas,). Grains of
+        every mass have this temperature on average. The total momentum is zero.
+      grains: given discs, see ``own_grains`` and ``prepare``; None for diameters uniform in σ ±
+        ``polydispersity``.
 
     Raises:
-      InputError: (a ValueError) the temperature is not a positive number, ``pack`` does not accept the grains, or this
-        function is called within ``jax.jit``, ``jax.vmap`` or a derivative.
+      InputError: (a ValueError) the temperature is not a positive number, ``pack`` does not accept
+        the grains, or this function is called within ``jax.jit``, ``jax.vmap`` or a derivative.
       RuntimeError: no packing was found.
     """
     if is_traced(flow, key, temperature, grains):
@@ -248,16 +294,21 @@ def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains
     temperatures = jnp.broadcast_to(jnp.asarray(temperature, float), len(keys))
     state, found = _heated(flows, keys, temperatures, discs, lockstep=in_lockstep())
     if not np.all(found):
-        raise RuntimeError("no packing without overlap was found: the packing fraction is too high for these grains.")
+        raise RuntimeError(
+            "no packing without overlap was found: the packing fraction is too high for these "
+            "grains."
+        )
     return jax.tree.map(lambda x: jnp.asarray(x[0] if single else x), state)
 
 
 def _replicas(
     name: str, flow: ShearFlow, key: Array, grains: Grains | None
 ) -> tuple[ShearFlow, Array, Grains | None, bool]:
-    """Flows, keys and given grains with a leading (replicas,) axis, and whether they are those of one replica.
+    """Flows, keys and given grains with a leading (replicas,) axis, and whether they are those of
+    one replica.
 
-    InputError if the key is not one or several, if the others do not suit it, or if JAX compiles the function.
+    InputError if the key is not one or several, if the others do not suit it, or if JAX compiles
+    the function.
     """
     if is_traced(jnp.zeros(())):  # inside of ``jax.jit``, whatever the arguments are
         raise InputError(_UNCOMPILED.format(name))
@@ -270,16 +321,26 @@ def _replicas(
     if grains is None:
         return stack(flows), keys, None, single
     batched = not single and isinstance(grains, Grains) and np.ndim(grains.radii) == 2
-    discs = [jax.tree.map(lambda x, k=k: np.asarray(x)[k], grains) if batched else grains for k in range(count)]
+    discs = [
+        jax.tree.map(lambda x, k=k: np.asarray(x)[k], grains) if batched else grains
+        for k in range(count)
+    ]
     for one, its in zip(flows, discs, strict=True):
         require_room(one, its)
-    return stack(flows), keys, jax.tree.map(lambda *x: jnp.asarray(np.stack(x), float), *discs), single
+    return (
+        stack(flows),
+        keys,
+        jax.tree.map(lambda *x: jnp.asarray(np.stack(x), float), *discs),
+        single,
+    )
 
 
 def _heated_replica(
     flow: ShearFlow, key: Array, temperature: Array, grains: Grains | None
 ) -> tuple[State, Bool[Array, ""]]:
-    """A packing with Gaussian velocities of a given temperature and no total momentum; False if none was found."""
+    """A packing with Gaussian velocities of a given temperature and no total momentum; False if
+    none was found.
+    """
     key = jax.random.wrap_key_data(key) if key.dtype == jnp.uint32 else key
     pack_key, heat_key = jax.random.split(key)
     state, found = pack(flow, pack_key, grains)
@@ -299,17 +360,27 @@ def _chunk(batch: Batch, strain: np.ndarray, advance: AdvanceBatch) -> tuple[Bat
 
 
 def _advanced(batch: Batch, steps: np.ndarray, advance: AdvanceBatch) -> tuple[Batch, Tally]:
-    """Advance every replica by its own number of time steps; one that is given up stays as it is."""
+    """Advance every replica by its own number of time steps; one that is given up stays as it
+    is.
+    """
     going_on = batch.status < GIVEN_UP
-    counts = jax.device_put(np.where(going_on, steps, 0).astype(np.int32))  # jnp.asarray would compile a program for it
+    counts = jax.device_put(
+        np.where(going_on, steps, 0).astype(np.int32)
+    )  # jnp.asarray would compile a program for it
     state, tally = advance(batch.flow, batch.numerics, batch.state, counts)
     tally = jax.tree.map(np.asarray, tally)
-    failed = np.where(tally.status >= GIVEN_UP, tally.status, Status.ok)  # the sample reports milder ones
+    failed = np.where(
+        tally.status >= GIVEN_UP, tally.status, Status.ok
+    )  # the sample reports milder ones
     return batch._replace(state=state, status=np.maximum(batch.status, failed)), tally
 
 
-def _blocks(batch: Batch, strain: np.ndarray, count: int, advance: AdvanceBatch) -> tuple[Batch, Tally]:
-    """Advance every replica by its own strain in ``count`` blocks, and keep all tallies, (replicas, count)."""
+def _blocks(
+    batch: Batch, strain: np.ndarray, count: int, advance: AdvanceBatch
+) -> tuple[Batch, Tally]:
+    """Advance every replica by its own strain in ``count`` blocks, and keep all tallies, (replicas,
+    count).
+    """
     tallies = []
     for steps in steps_of_blocks(steps_of_strain(batch.flow, strain), count).T:
         batch, tally = _advanced(batch, steps, advance)
@@ -318,7 +389,9 @@ def _blocks(batch: Batch, strain: np.ndarray, count: int, advance: AdvanceBatch)
 
 
 def _doubled(tally: Tally, more: Tally) -> Tally:
-    """The same number of blocks with twice the strain: pairs of old blocks joined, then the new blocks ``more``."""
+    """The same number of blocks with twice the strain: pairs of old blocks joined, then the new
+    blocks ``more``.
+    """
     pairs = jax.tree.map(lambda x: x.reshape(x.shape[0], -1, 2, *x.shape[2:]), tally).total(axis=2)
     return jax.tree.map(lambda old, new: np.concatenate([old, new], axis=1), pairs, more)
 
@@ -334,8 +407,11 @@ def _as_sample(batch: Batch, tally: Tally) -> Sample:
     return Sample(tally, side**2, shear_rate, batch.flow.grains)
 
 
-def _sheared(batch: Batch, strain: np.ndarray, advance: AdvanceBatch, measure: bool = False) -> Batch:
-    """Shear every replica by its own strain, in chunks of at most 1 so that progress can be reported.
+def _sheared(
+    batch: Batch, strain: np.ndarray, advance: AdvanceBatch, measure: bool = False
+) -> Batch:
+    """Shear every replica by its own strain, in chunks of at most 1 so that progress can be
+    reported.
 
     With ``measure`` the last chunk gives the correlation strain.
     """
@@ -343,19 +419,25 @@ def _sheared(batch: Batch, strain: np.ndarray, advance: AdvanceBatch, measure: b
     for steps in steps_of_blocks(steps_of_strain(batch.flow, strain), chunks).T:
         batch, tally = _advanced(batch, steps, advance)
         if measure:
-            batch = batch._replace(correlation_strain=_correlation_strain(batch, _averages(batch, tally)))
+            batch = batch._replace(
+                correlation_strain=_correlation_strain(batch, _averages(batch, tally))
+            )
     return batch._replace(strain=batch.strain + strain)
 
 
 def _correlation_strain(batch: Batch, averages: Mapping[str, np.ndarray]) -> np.ndarray:
     """Correlation strain of each flow of a batch, see ``flow_correlation_strain``."""
-    masses = np.ascontiguousarray(batch.state.grains.masses)  # or the order of the sum would depend on their place
+    masses = np.ascontiguousarray(
+        batch.state.grains.masses
+    )  # or the order of the sum would depend on their place
     mass, area = np.sum(masses, axis=-1), np.asarray(batch.state.side) ** 2
     return flow_correlation_strain(averages, batch.flow.grains, mass, area, batch.flow.shear_rate)
 
 
 def _until_steady(batch: Batch, advance: AdvanceBatch) -> Batch:
-    """Shear in chunks until every replica is steady, or ``_MOST_CHUNKS`` times; steady replicas are not advanced."""
+    """Shear in chunks until every replica is steady, or ``_MOST_CHUNKS`` times; steady replicas are
+    not advanced.
+    """
     count = len(batch.status)
     steady, record = np.zeros(count, bool), []
     for chunks in range(1, _MOST_CHUNKS + 1):
@@ -373,17 +455,21 @@ def _until_steady(batch: Batch, advance: AdvanceBatch) -> Batch:
         if chunks >= _FEWEST_CHUNKS:
             late = np.stack(record[chunks // 3 :])
             judge = _is_level if chunks < _MOST_CHUNKS else _is_level_noise
-            level = [steady[k] or all(judge(late[:, q, k], correlation[k]) for q in (0, 1)) for k in range(count)]
+            level = [
+                steady[k] or all(judge(late[:, q, k], correlation[k]) for q in (0, 1))
+                for k in range(count)
+            ]
             steady = steady | (np.array(level) & ~waiting)
     status = np.where(steady, Status.ok, Status.not_steady)
     return batch._replace(status=np.maximum(batch.status, status))
 
 
 def _shortened(batch: Batch, flow: ShearFlow, advance: AdvanceBatch) -> Batch:
-    """Shorten the time step geometrically from the coarse one to that of the flow, and relax at the final one.
+    """Shorten the time step geometrically from the coarse one to that of the flow, and relax at the
+    final one.
 
-    Every replica has its own series of time steps, which does not depend on the other replicas of the batch. A replica
-    whose series has ended is not advanced.
+    Every replica has its own series of time steps, which does not depend on the other replicas of
+    the batch. A replica whose series has ended is not advanced.
     """
     coarse, final = np.asarray(batch.flow.timestep), np.asarray(flow.timestep)
     ladders = [timestep_ladder(*ends) for ends in zip(coarse[:, None], final[:, None], strict=True)]
@@ -398,15 +484,20 @@ def _shortened(batch: Batch, flow: ShearFlow, advance: AdvanceBatch) -> Batch:
 
 
 def _is_level(series: np.ndarray, least_correlation: float = 0.0) -> bool:
-    """Whether the means of the two halves of a series agree, and the error of their difference is small."""
+    """Whether the means of the two halves of a series agree, and the error of their difference is
+    small.
+    """
     difference, error = drift(series, least_correlation)
     return bool(
-        error <= _LARGEST_STEADY_ERROR and abs(difference) <= max(_LARGEST_STEADY_RATIO * error, _LARGEST_STEADY_DRIFT)
+        error <= _LARGEST_STEADY_ERROR
+        and abs(difference) <= max(_LARGEST_STEADY_RATIO * error, _LARGEST_STEADY_DRIFT)
     )
 
 
 def _is_level_noise(series: np.ndarray, least_correlation: float = 0.0) -> bool:
-    """Whether the means of the two halves of a long series agree within its noise, which may be large."""
+    """Whether the means of the two halves of a long series agree within its noise, which may be
+    large.
+    """
     place = np.arange(len(series)) - (len(series) - 1) / 2
     slope = np.sum(place * series) / np.sum(place**2)
     difference, _ = drift(series)

@@ -2,15 +2,17 @@
 
 In one step dt a grain of thermal speed moves by x = dt √T/σ. The errors follow from x:
 
-- The deepest overlap of a sample is about K x diameters. K grows towards jamming, where grains are caught between
-  others. It is larger with the touching rule, which finds a contact only after the grains overlap.
-- The relative error of the stresses is at most about x over the mean gap between grains, (ν_J − ν)/2ν diameters. This
-  ratio is the share of its free path that a grain moves in one step. With the midpoint rule the error is far smaller
-  for grains that bounce.
+- The deepest overlap of a sample is about K x diameters. K grows towards jamming, where grains are
+  caught between others. It is larger with the touching rule, which finds a contact only after the
+  grains overlap.
+- The relative error of the stresses is at most about x over the mean gap between grains, (ν_J −
+  ν)/2ν diameters. This ratio is the share of its free path that a grain moves in one step. With the
+  midpoint rule the error is far smaller for grains that bounce.
 
-Kinetic theory underestimates the temperature of dense flows: close to jamming the geometry drives the grains, for any
-restitution. The numbers here are bounds on what ``python -m benchmarks stability`` and ``python -m benchmarks
-speed_vs_accuracy`` find for this size distribution. They serve to choose a time step and are not results.
+Kinetic theory underestimates the temperature of dense flows: close to jamming the geometry drives
+  the grains, for any restitution. The numbers here are bounds on what ``python -m benchmarks
+  stability`` and ``python -m benchmarks speed_vs_accuracy`` find for this size distribution. They
+  serve to choose a time step and are not results.
 """
 
 import numpy as np
@@ -31,22 +33,37 @@ _COARSE_CROSSING = 0.03  # the same limit for the coarse time step
 _SMALLEST_DISTANCE = 1e-3  # smallest distance to jamming that enters a bound, in packing fraction
 
 
-def expected_temperature(theory: ArrayLike, packing_fraction: ArrayLike, shear_rate: ArrayLike = 1.0) -> np.ndarray:
-    """Granular temperature of a flow in mσ²/t²: that of kinetic theory and a term from the geometry of dense packings.
+def expected_temperature(
+    theory: ArrayLike, packing_fraction: ArrayLike, shear_rate: ArrayLike = 1.0
+) -> np.ndarray:
+    """Granular temperature of a flow in mσ²/t²: that of kinetic theory and a term from the geometry
+    of dense packings.
 
     It is within a factor of two of simulations for 0 ≤ α ≤ 0.98 and 0.2 ≤ ν ≤ 0.83.
     """
-    return np.asarray(theory) + 0.02 * np.asarray(shear_rate) ** 2 / distance_to_jamming(packing_fraction) ** 1.2
+    return (
+        np.asarray(theory)
+        + 0.02 * np.asarray(shear_rate) ** 2 / distance_to_jamming(packing_fraction) ** 1.2
+    )
 
 
-def longest_timestep(temperature: ArrayLike, packing_fraction: ArrayLike, activation: Activation) -> np.ndarray:
-    """Longest time step, in t, for which a sample of strain 10 and some hundred grains has no deep overlap."""
-    overlap = 2.5 + 1.23 / np.sqrt(distance_to_jamming(packing_fraction)) + (3 if activation == "touching" else 0)
+def longest_timestep(
+    temperature: ArrayLike, packing_fraction: ArrayLike, activation: Activation
+) -> np.ndarray:
+    """Longest time step, in t, for which a sample of strain 10 and some hundred grains has no deep
+    overlap.
+    """
+    overlap = (
+        2.5
+        + 1.23 / np.sqrt(distance_to_jamming(packing_fraction))
+        + (3 if activation == "touching" else 0)
+    )
     return DEEP_OVERLAP / (overlap * np.sqrt(np.asarray(temperature)))
 
 
 def stress_error(crossing: ArrayLike, packing_fraction: ArrayLike) -> np.ndarray:
-    """Bound on the relative error of pressure and shear stress from the time step, by the crossing x = dt √T/σ.
+    """Bound on the relative error of pressure and shear stress from the time step, by the crossing
+    x = dt √T/σ.
 
     Examples:
       The same crossing causes a larger error where the gaps are small:
@@ -54,7 +71,9 @@ def stress_error(crossing: ArrayLike, packing_fraction: ArrayLike) -> np.ndarray
       >>> [round(float(stress_error(1e-3, nu)), 3) for nu in (0.5, 0.7, 0.8)]
       [0.003, 0.01, 0.041]
     """
-    gap = np.minimum(distance_to_jamming(packing_fraction) / (2 * np.asarray(packing_fraction)), 0.5)
+    gap = np.minimum(
+        distance_to_jamming(packing_fraction) / (2 * np.asarray(packing_fraction)), 0.5
+    )
     return np.asarray(crossing) / gap
 
 
@@ -73,15 +92,17 @@ def distance_to_jamming(packing_fraction: ArrayLike) -> np.ndarray:
 
 
 def check_timestep(flow: ShearFlow, theory: SteadyShear, grains: Grains | None = None) -> None:
-    """Raise an InputError if a grain of thermal speed crosses more than a tenth of a diameter in one step.
+    """Raise an InputError if a grain of thermal speed crosses more than a tenth of a diameter in
+    one step.
 
-    For the default grains this is the mean diameter and the thermal speed of a mean grain. For given grains it is the
-    grain that crosses its own diameter fastest.
+    For the default grains this is the mean diameter and the thermal speed of a mean grain. For
+    given grains it is the grain that crosses its own diameter fastest.
     """
     shortest = 0.999 * SHORTEST_TIMESTEP  # with room for rounding
     if np.any(np.asarray(flow.timestep) * np.asarray(flow.shear_rate) < shortest):
         raise InputError(
-            f"timestep must be at least {SHORTEST_TIMESTEP:g} / shear_rate, or the steps would be too many to count."
+            f"timestep must be at least {SHORTEST_TIMESTEP:g} / shear_rate, or the steps would be "
+            "too many to count."
         )
     longest = _LARGEST_CROSSING / _crossing_rate(theory, grains)
     too_long = np.asarray(flow.timestep) > longest
@@ -89,7 +110,8 @@ def check_timestep(flow: ShearFlow, theory: SteadyShear, grains: Grains | None =
         worst = np.argmax(np.asarray(flow.timestep) / longest)
         alpha, nu = (float(np.asarray(x)[worst]) for x in (flow.restitution, flow.packing_fraction))
         raise InputError(
-            f"timestep must be at most {two_digits(longest[worst], up=False)} at restitution {alpha:g} and packing "
+            f"timestep must be at most {two_digits(longest[worst], up=False)} at restitution "
+            f"{alpha:g} and packing "
             f"fraction {nu:g}, or grains would cross more than a tenth of a diameter in one step."
         )
 
@@ -97,19 +119,30 @@ def check_timestep(flow: ShearFlow, theory: SteadyShear, grains: Grains | None =
 def _crossing_rate(theory: SteadyShear, grains: Grains | None) -> np.ndarray:
     """Diameters that a grain of thermal speed crosses in a unit of time, in 1/t."""
     speed = np.sqrt(2 * np.asarray(theory.granular_temperature))
-    return speed if grains is None else speed / np.min(2 * grains.radii * np.sqrt(grains.masses), axis=-1)
+    return (
+        speed
+        if grains is None
+        else speed / np.min(2 * grains.radii * np.sqrt(grains.masses), axis=-1)
+    )
 
 
-def bounded_coarse_timestep(flow: ShearFlow, theory: SteadyShear, grains: Grains | None = None) -> np.ndarray:
-    """The coarse time step of each flow, in t: short enough for its thermal speed, not shorter than its own step."""
+def bounded_coarse_timestep(
+    flow: ShearFlow, theory: SteadyShear, grains: Grains | None = None
+) -> np.ndarray:
+    """The coarse time step of each flow, in t: short enough for its thermal speed, not shorter than
+    its own step.
+    """
     coarse = np.minimum(
-        COARSE_TIMESTEP / np.asarray(flow.shear_rate), _COARSE_CROSSING / _crossing_rate(theory, grains)
+        COARSE_TIMESTEP / np.asarray(flow.shear_rate),
+        _COARSE_CROSSING / _crossing_rate(theory, grains),
     )
     timestep = np.asarray(flow.timestep)
     return np.maximum(coarse.astype(timestep.dtype), timestep)
 
 
 def timestep_ladder(coarse: np.ndarray, final: np.ndarray) -> list[float]:
-    """Time steps between a coarse and a final one, (1,) each, without these; equal ratios of at most ``SHORTENING``."""
+    """Time steps between a coarse and a final one, (1,) each, without these; equal ratios of at
+    most ``SHORTENING``.
+    """
     steps = int(np.ceil(np.log(coarse / final) / np.log(SHORTENING) - 1e-9).item())
     return [(coarse * (final / coarse) ** (k / steps)).item() for k in range(1, steps)]

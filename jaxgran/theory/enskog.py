@@ -1,4 +1,5 @@
-"""Enskog's collisional stress and dissipation rate at a given temperature tensor, for instance a measured one.
+"""Enskog's collisional stress and dissipation rate at a given temperature tensor, for instance a
+measured one.
 
 Units: ``steady_shear``.
 """
@@ -15,10 +16,14 @@ from jaxgran.theory.steady_shear import Scalar, as_floats
 
 
 class CollisionalTransfer(NamedTuple):
-    """Momentum that collisions transfer, and energy that they lose, per unit area and time; stresses are symmetric."""
+    """Momentum that collisions transfer, and energy that they lose, per unit area and time;
+    stresses are symmetric.
+    """
 
     stress: Float[Array, "*replicas 2 2"]  # Σ d n ⊗ n p over the collisions, the collisional stress
-    speed_stress: Float[Array, "*replicas 2 2"]  # the same, each collision times its speed of approach w
+    speed_stress: Float[
+        Array, "*replicas 2 2"
+    ]  # the same, each collision times its speed of approach w
     dissipation_rate: Float[Array, "*replicas"]  # Σ (1 − α²) μ w²/2 over the collisions
 
 
@@ -31,7 +36,8 @@ def collisional_transfer(
     polydispersity: Scalar = 0.26,
     size_classes: int = 4,
 ) -> CollisionalTransfer:
-    """Collisional stress and dissipation rate of Enskog's theory for Gaussian velocities of a temperature tensor.
+    """Collisional stress and dissipation rate of Enskog's theory for Gaussian velocities of a
+    temperature tensor.
 
     ================  ========  =======================================================
     name              unit      meaning
@@ -46,10 +52,10 @@ def collisional_transfer(
     returns                     CollisionalTransfer
     ================  ========  =======================================================
 
-    The approach speed w of a pair along its normal n is Gaussian, with mean −γ̇ d n_x n_y and variance
-    n·T·n (1/m_i + 1/m_j). A collision transfers the impulse p = (1 + α) μ w and loses the energy (1 − α) p w/2, so the
-    stress is ½ Σ_ij n_i n_j χ_ij d_ij² (1 + α) μ_ij ∮ dn n ⊗ n ⟨w²⟩ and the dissipation rate
-    ¼ Σ_ij n_i n_j χ_ij d_ij (1 − α²) μ_ij ∮ dn ⟨w³⟩, averaged over w > 0.
+    The approach speed w of a pair along its normal n is Gaussian, with mean −γ̇ d n_x n_y and
+    variance n·T·n (1/m_i + 1/m_j). A collision transfers the impulse p = (1 + α) μ w and loses the
+    energy (1 − α) p w/2, so the stress is ½ Σ_ij n_i n_j χ_ij d_ij² (1 + α) μ_ij ∮ dn n ⊗ n ⟨w²⟩
+    and the dissipation rate ¼ Σ_ij n_i n_j χ_ij d_ij (1 − α²) μ_ij ∮ dn ⟨w³⟩, averaged over w > 0.
 
     Source: J. T. Jenkins and M. W. Richman, J. Fluid Mech. 192, 313 (1988).
 
@@ -65,7 +71,10 @@ def collisional_transfer(
 
 
 def mixture_transfer(
-    temperature: Float[Array, "2 2"], alpha: Float[Array, ""], rate: Float[Array, ""], mixture: Mixture
+    temperature: Float[Array, "2 2"],
+    alpha: Float[Array, ""],
+    rate: Float[Array, ""],
+    mixture: Mixture,
 ) -> CollisionalTransfer:
     """``collisional_transfer`` of a mixture of given size classes."""
     dtype = mixture.diameters.dtype
@@ -79,9 +88,14 @@ def mixture_transfer(
         jnp.sqrt(spread[:, :, None] * along[None, None, :]),
     )  # each (classes, classes, angles)
     arc = 2 * jnp.pi / ANGLES  # both halves of the circle contribute equally
-    pairs = mixture.number_densities[:, None] * mixture.encounters / 2  # half: each pair is summed twice
+    pairs = (
+        mixture.number_densities[:, None] * mixture.encounters / 2
+    )  # half: each pair is summed twice
     impulse = arc * pairs * (1 + alpha) * mixture.reduced_masses  # over the speed of approach
     stress, speed_stress = (
-        jnp.einsum("ij,ijk,ak,bk->ab", impulse * distances, moment, normals, normals) for moment in (second, third)
+        jnp.einsum("ij,ijk,ak,bk->ab", impulse * distances, moment, normals, normals)
+        for moment in (second, third)
     )
-    return CollisionalTransfer(stress, speed_stress, (1 - alpha) / 2 * jnp.einsum("ij,ijk->", impulse, third))
+    return CollisionalTransfer(
+        stress, speed_stress, (1 - alpha) / 2 * jnp.einsum("ij,ijk->", impulse, third)
+    )

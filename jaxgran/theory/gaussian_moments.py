@@ -1,8 +1,9 @@
 """Kinetic theory with anisotropic Gaussian velocities, for any size distribution.
 
-Each size class has its own temperature tensor, in which collisions balance the work of the shear at any restitution and
-beyond linear order in the shear rate. The theory neglects correlations between the velocities of neighbours, so it
-fails near jamming and in dense flow at small restitution. Units: ``steady_shear``.
+Each size class has its own temperature tensor, in which collisions balance the work of the shear at
+any restitution and beyond linear order in the shear rate. The theory neglects correlations between
+the velocities of neighbours, so it fails near jamming and in dense flow at small restitution.
+Units: ``steady_shear``.
 """
 
 from functools import partial
@@ -28,7 +29,8 @@ def gaussian_moments(
     polydispersity: Scalar = 0.26,
     size_classes: int = 4,
 ) -> SteadyShear:
-    """Steady shear of polydisperse discs with Gaussian velocities and a temperature tensor for each size class.
+    """Steady shear of polydisperse discs with Gaussian velocities and a temperature tensor for each
+    size class.
 
     ================  ====  =======================================================
     name              unit  meaning
@@ -43,15 +45,20 @@ def gaussian_moments(
                             balances the work of the shear
     ================  ====  =======================================================
 
-    In each class the second moments balance: −γ̇(δ_ax T_yb + δ_bx T_ay) + Q_ab = 0, with Q Enskog's collision integral
-    including the shear across the contact. It is solved by Newton's method and differentiated implicitly.
+    In each class the second moments balance: −γ̇(δ_ax T_yb + δ_bx T_ay) + Q_ab = 0, with Q Enskog's
+      collision integral including the shear across the contact. It is solved by Newton's method and
+      differentiated implicitly.
 
-    Source: J. T. Jenkins and M. W. Richman, J. Fluid Mech. 192, 313 (1988); J. F. Lutsko, Phys. Rev. E 70, 061101
-    (2004). Contact values of the mixture: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
+    Source: J. T. Jenkins and M. W. Richman, J. Fluid Mech. 192, 313 (1988); J. F. Lutsko, Phys.
+      Rev. E 70, 061101 (2004). Contact values of the mixture: J. T. Jenkins and F. Mancini, J.
+      Appl. Mech. 54, 27 (1987).
     """
     alpha, nu, rate, width = as_floats(restitution, packing_fraction, shear_rate, polydispersity)
     return steady_moments(
-        alpha, rate, uniform_mixture(nu, width, size_classes), jnp.log(garzo_dufty(alpha, nu).granular_temperature)
+        alpha,
+        rate,
+        uniform_mixture(nu, width, size_classes),
+        jnp.log(garzo_dufty(alpha, nu).granular_temperature),
     )
 
 
@@ -63,7 +70,8 @@ def mixture_moments(
     diameters: Float[Array, " classes"],
     masses: Float[Array, " classes"],
 ) -> SteadyShear:
-    """``gaussian_moments`` of a mixture with the same number of grains in each class of diameter and mass.
+    """``gaussian_moments`` of a mixture with the same number of grains in each class of diameter
+    and mass.
 
     ================  =======  ====================================================
     name              unit     meaning
@@ -89,7 +97,8 @@ def steady_moments(
     guess: Float[Array, ""],
     length: Float[Array, ""] | float = 1.0,
 ) -> SteadyShear:
-    """Solve the balance of the moments of a mixture, from a guess of the logarithm of its temperature.
+    """Solve the balance of the moments of a mixture, from a guess of the logarithm of its
+    temperature.
 
     Collisions lose 1/length of the energy that they lose in Enskog's theory.
     """
@@ -98,13 +107,19 @@ def steady_moments(
         temperatures = _temperatures(unknowns)
         return _moment_balance(temperatures, _collisions(temperatures, alpha, mixture, length))
 
-    start = jnp.stack([guess, guess, -0.3 * jnp.ones_like(guess)])[:, None] * jnp.ones_like(mixture.diameters)[None, :]
+    start = (
+        jnp.stack([guess, guess, -0.3 * jnp.ones_like(guess)])[:, None]
+        * jnp.ones_like(mixture.diameters)[None, :]
+    )
     solution = jax.lax.custom_root(imbalance, start, _newton, _dense_linear_solve)
 
-    # Solved at unit shear rate: there is no other time scale, so temperatures and stresses scale as γ̇²
+    # Solved at unit shear rate: there is no other time scale, so temperatures and stresses scale as
+    # γ̇²
     temperatures = _temperatures(solution)
     collisions = _collisions(temperatures, alpha, mixture, length)
-    xx, yy, xy = jnp.sum(mixture.number_densities[None, :] * temperatures, axis=1) + collisions.stress
+    xx, yy, xy = (
+        jnp.sum(mixture.number_densities[None, :] * temperatures, axis=1) + collisions.stress
+    )
     kinetic = jnp.sum(mixture.number_densities * (temperatures[0] + temperatures[1])) / 2
     return SteadyShear(
         granular_temperature=kinetic / jnp.sum(mixture.number_densities) * rate**2,
@@ -132,12 +147,13 @@ def _collisions(
 ) -> _Collisions:
     """Enskog collision integrals of Gaussian velocities.
 
-    Let n be the normal from grain i to grain j. The approach speed w = (v_i − v_j)·n is Gaussian, with mean
-    −γ̇ d_ij n_x n_y and variance n·(T_i/m_i + T_j/m_j)·n. A collision adds −J n/m_i to v_i, J = (1+α) μ_ij w, so
-    the temperature tensor of class i changes at the rate Σ_j n_j χ_ij d_ij ∮ dn ⟨w [J² n n/m_i − J (n c_i + c_i n)]⟩.
-    The average is over w > 0, where ⟨w² c_i⟩ = 2⟨w⟩ T_i·n/m_i, because c_i and w are jointly Gaussian. Of the energy
-    (1 − α²) μ_ij w²/2 that a collision loses, the part 1 − 1/length is given back: to grain i the share μ_ij/m_i, to
-    both directions alike.
+    Let n be the normal from grain i to grain j. The approach speed w = (v_i − v_j)·n is Gaussian,
+    with mean −γ̇ d_ij n_x n_y and variance n·(T_i/m_i + T_j/m_j)·n. A collision adds −J n/m_i to
+    v_i, J = (1+α) μ_ij w, so the temperature tensor of class i changes at the rate Σ_j n_j χ_ij
+    d_ij ∮ dn ⟨w [J² n n/m_i − J (n c_i + c_i n)]⟩. The average is over w > 0, where ⟨w² c_i⟩ = 2⟨w⟩
+    T_i·n/m_i, because c_i and w are jointly Gaussian. Of the energy (1 − α²) μ_ij w²/2 that a
+    collision loses, the part 1 − 1/length is given back: to grain i the share μ_ij/m_i, to both
+    directions alike.
     """
     angle = (jnp.arange(ANGLES, dtype=temperatures.dtype) + 0.5) * (jnp.pi / ANGLES)
     nx, ny = jnp.cos(angle)[None, :], jnp.sin(angle)[None, :]
@@ -158,7 +174,9 @@ def _collisions(
     drag = jnp.stack([2 * nx * push_x, 2 * ny * push_y, nx * push_y + ny * push_x])
     kept = (1 - 1 / length) * (1 - alpha) / (1 + alpha) * jnp.sum(gain, axis=1)
     isotropic = jnp.array([0.5, 0.5, 0.0], kept.dtype)[:, None]
-    source = jnp.sum(gain[None] * normals - 2 * loss[None] * drag, axis=2) + isotropic * kept[None, :]
+    source = (
+        jnp.sum(gain[None] * normals - 2 * loss[None] * drag, axis=2) + isotropic * kept[None, :]
+    )
     source = source / mixture.masses[None, :]
 
     per_area = mixture.number_densities[:, None] * mixture.encounters * arc
@@ -167,13 +185,18 @@ def _collisions(
     per_grain = per_area / jnp.sum(mixture.number_densities)
     return _Collisions(
         source=source,
-        stress=jnp.sum(normals * jnp.sum(transfer[:, :, None] * second, axis=(0, 1))[None, None, :], axis=(1, 2)),
+        stress=jnp.sum(
+            normals * jnp.sum(transfer[:, :, None] * second, axis=(0, 1))[None, None, :],
+            axis=(1, 2),
+        ),
         dissipation=jnp.sum(lost[:, :, None] * third) / length,
         rate=jnp.sum(per_grain[:, :, None] * first),
     )
 
 
-def _moment_balance(temperatures: Float[Array, "3 classes"], collisions: _Collisions) -> Float[Array, "3 classes"]:
+def _moment_balance(
+    temperatures: Float[Array, "3 classes"], collisions: _Collisions
+) -> Float[Array, "3 classes"]:
     """Rate of change of each temperature tensor at unit shear rate, relative to its trace."""
     txx, tyy, txy = temperatures
     shear = jnp.stack([2 * txy, jnp.zeros_like(tyy), tyy])
@@ -186,14 +209,16 @@ def _temperatures(unknowns: Float[Array, "3 classes"]) -> Float[Array, "3 classe
     The unknowns are ln T_xx, ln T_yy and artanh(T_xy/√(T_xx T_yy)).
     """
     log_xx, log_yy, artanh_xy = unknowns
-    return jnp.stack([jnp.exp(log_xx), jnp.exp(log_yy), jnp.exp((log_xx + log_yy) / 2) * jnp.tanh(artanh_xy)])
+    return jnp.stack(
+        [jnp.exp(log_xx), jnp.exp(log_yy), jnp.exp((log_xx + log_yy) / 2) * jnp.tanh(artanh_xy)]
+    )
 
 
 def _newton(function, start):
     """Root of `function` by Newton's method with a bounded step.
 
-    It stops after the first step below the square root of machine epsilon, as convergence is quadratic. The root is NaN
-    if no step is below it.
+    It stops after the first step below the square root of machine epsilon, as convergence is
+    quadratic. The root is NaN if no step is below it.
     """
     tolerance = jnp.finfo(start.dtype).eps ** 0.5
 
@@ -239,4 +264,6 @@ def _eliminated(matrix: Float[Array, "n n"], side: Float[Array, " n"]) -> Float[
         rows = rows.at[best].set(rows[k])
         return jnp.where((places == k)[:, None], pivot, rows - rows[:, k, None] * pivot)
 
-    return jax.lax.fori_loop(0, side.size, eliminate, jnp.concatenate([matrix, side[:, None]], axis=1))[:, -1]
+    return jax.lax.fori_loop(
+        0, side.size, eliminate, jnp.concatenate([matrix, side[:, None]], axis=1)
+    )[:, -1]

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-ANGLES = 32  # contact directions on the half circle; the integrand is smooth and periodic, so the error is below 1e-11
+# Contact directions on the half circle; the integrand is smooth and periodic: errors below 1e-11
+ANGLES = 32
 
 
 class Mixture(NamedTuple):
@@ -16,7 +17,9 @@ class Mixture(NamedTuple):
     diameters: Float[Array, " classes"]
     masses: Float[Array, " classes"]
     number_densities: Float[Array, " classes"]  # grains per unit area
-    encounters: Float[Array, "classes classes"]  # number density of the second class times the contact diameter and χ
+    encounters: Float[
+        Array, "classes classes"
+    ]  # number density of the second class times the contact diameter and χ
 
     @property
     def contact_diameters(self) -> Float[Array, "classes classes"]:
@@ -45,10 +48,11 @@ def mixture_of(nu: Float[Array, ""], diameters: Array, masses: Array, fractions:
 
 
 def mixture_contact_value(d_i: Any, d_j: Any, nu: Any, mean: Any, mean_square: Any) -> Any:
-    """Contact value χ of discs of diameters d_i and d_j (broadcast) in an equilibrium mixture; of JAX or NumPy arrays.
+    """Contact value χ of discs of diameters d_i and d_j (broadcast) in an equilibrium mixture; of
+    JAX or NumPy arrays.
 
-    χ_ij = 1/(1 − ν) + (9/8) d_i d_j/(d_i + d_j) ν⟨d⟩/⟨d²⟩/(1 − ν)², with ν the packing fraction of the mixture and
-    ⟨d⟩ and ⟨d²⟩ of its diameters. For discs of one size it is Henderson's value.
+    χ_ij = 1/(1 − ν) + (9/8) d_i d_j/(d_i + d_j) ν⟨d⟩/⟨d²⟩/(1 − ν)², with ν the packing fraction of
+    the mixture and ⟨d⟩ and ⟨d²⟩ of its diameters. For discs of one size it is Henderson's value.
 
     Source: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
     """

@@ -1,7 +1,8 @@
 """SteadyShear, the prediction of every theory here, and what the theories share.
 
-Lengths are in mean diameters, masses in the mass of a grain of mean diameter. A grain of diameter d has mass d² unless
-its mass is given. All functions are differentiable and treat one flow; `jax.vmap` adds a leading `(replicas,)`.
+Lengths are in mean diameters, masses in the mass of a grain of mean diameter. A grain of diameter d
+has mass d² unless its mass is given. All functions are differentiable and treat one flow;
+`jax.vmap` adds a leading `(replicas,)`.
 """
 
 from dataclasses import dataclass
@@ -19,19 +20,21 @@ Scalar = float | int | Real[Array, ""]
 class SteadyShear:
     """Prediction of a theory for steady simple shear.
 
-    ====================  =======  ===========================================================================
+    ====================  =======  =================================================================
     field                 unit     meaning
-    ====================  =======  ===========================================================================
+    ====================  =======  =================================================================
     granular_temperature  m(σ/t)²  Σ m c²/(2N), c the peculiar velocity
     pressure              m/t²     half the trace of the stress, kinetic and collisional
     shear_stress          m/t²     positive, kinetic and collisional
-    collision_rate        –        collisions per grain and unit strain; each grain counts all its collisions
-    dissipation_rate      m/t³     energy lost per unit area and time; equals the power of the shear,
+    collision_rate        –        collisions per grain and unit strain; each grain counts all its
+                                   collisions
+    dissipation_rate      m/t³     energy lost per unit area and time; equals the power of the
+                                   shear,
                                    shear_stress × shear_rate
-    ====================  =======  ===========================================================================
+    ====================  =======  =================================================================
 
-    All are scalars, with a leading ``(replicas,)`` under ``vmap``. The unit of time t is that of the shear rate; at the
-    default γ̇ = 1, all numbers are in units of m = σ = γ̇ = 1.
+    All are scalars, with a leading ``(replicas,)`` under ``vmap``. The unit of time t is that of
+    the shear rate; at the default γ̇ = 1, all numbers are in units of m = σ = γ̇ = 1.
     """
 
     granular_temperature: Float[Array, "*replicas"]

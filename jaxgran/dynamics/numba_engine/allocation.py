@@ -1,8 +1,8 @@
 """The arrays of the numba engine, cut from one block of memory.
 
-The handler allocates the block, one for each replica, unless XLA keeps it for another call. So the engine needs no
-runtime of numba. That is why an intrinsic makes the arrays, by ``numba.np.arrayobj``: the public ``numba.carray`` needs
-the runtime.
+The handler allocates the block, one for each replica, unless XLA keeps it for another call. So the
+engine needs no runtime of numba. That is why an intrinsic makes the arrays, by
+``numba.np.arrayobj``: the public ``numba.carray`` needs the runtime.
 """
 
 # pyright: reportCallIssue=false
@@ -34,7 +34,9 @@ _PAIR_CAPACITY = 16  # slots of pairs for each grain
 
 
 class Arrays(NamedTuple):
-    """All arrays of the time loop: see ``layout``; step_sums: (NUMBERS,); saved: (NUMBERS + SAVED,), see ``loop``."""
+    """All arrays of the time loop: see ``layout``; step_sums: (NUMBERS,); saved: (NUMBERS +
+    SAVED,), see ``loop``.
+    """
 
     grains: Any
     pairs: Any
@@ -46,7 +48,9 @@ class Arrays(NamedTuple):
 
 
 def _array_of(kind: types.Type) -> Any:
-    """An intrinsic ``array(address, shape)``: an array of this dtype over existing memory, without reference counts."""
+    """An intrinsic ``array(address, shape)``: an array of this dtype over existing memory, without
+    reference counts.
+    """
 
     @intrinsic
     def array(context, address, shape):
@@ -74,7 +78,9 @@ _signed_at, _unsigned_at = _array_of(types.int32), _array_of(types.uint32)
 
 @inline_njit
 def _reserve(memory, count, size):
-    """Bump allocator: reserve ``count * size`` bytes; ``memory`` is (1,), the address of the first free byte."""
+    """Bump allocator: reserve ``count * size`` bytes; ``memory`` is (1,), the address of the first
+    free byte.
+    """
     address = memory[0]
     memory[0] += (count * size + 7) // 8 * 8
     return address
@@ -139,7 +145,8 @@ def _clusters_of(memory, count, dv):
 
 @inline_njit
 def arrays_of(memory, count):
-    """All arrays for ``count`` grains, as they are before the first step, and whether the block has room for them.
+    """All arrays for ``count`` grains, as they are before the first step, and whether the block has
+    room for them.
 
     ``memory`` is (1,), the address of a block of ``WORDS + WORDS_PER_GRAIN · count`` words.
     """

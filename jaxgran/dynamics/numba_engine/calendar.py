@@ -1,8 +1,10 @@
-"""The calendar of pairs: in which steps each near pair will be a contact, as long as neither grain is struck.
+"""The calendar of pairs: in which steps each near pair will be a contact, as long as neither grain
+is struck.
 
-Between two impulses both grains of a pair fly freely, so these steps follow from a quadratic equation. The next step to
-visit is the smallest entry, and its contacts follow from comparisons of whole numbers. Where an event has few contacts
-among many pairs, lower bounds of the entries of each block say which blocks need to be looked at.
+Between two impulses both grains of a pair fly freely, so these steps follow from a quadratic
+equation. The next step to visit is the smallest entry, and its contacts follow from comparisons of
+whole numbers. Where an event has few contacts among many pairs, lower bounds of the entries of each
+block say which blocks need to be looked at.
 """
 
 import math
@@ -40,7 +42,9 @@ _ROW, _ROW_SHIFT = 16, 4  # bounds that are compared together
 
 @inline_njit
 def pair_motion(p, t, flow, grains, pairs):
-    """Both grains of a pair, its separation at the time t since the search, and its relative velocity."""
+    """Both grains of a pair, its separation at the time t since the search, and its relative
+    velocity.
+    """
     motion, images = grains.motion, pairs.images
     i, j = pairs.ends[FIRST, p], pairs.ends[SECOND, p]
     up = images[ROW, p] * flow.side
@@ -52,11 +56,12 @@ def pair_motion(p, t, flow, grains, pairs):
 
 @inline_njit
 def predict_contact_steps(count, t, earliest, horizon, shift, flow, grains, pairs):
-    """Write when, from the step ``earliest`` on, the listed pairs are contacts if their grains are not struck.
+    """Write when, from the step ``earliest`` on, the listed pairs are contacts if their grains are
+    not struck.
 
-    ``t`` is the present time, and ``horizon`` the time from now after which the list is no longer valid. The bounds of
-    blocks of ``2**shift`` entries are lowered where there are any. Pairs are taken together, and the arithmetic has no
-    branches, so that a processor vectorises it.
+    ``t`` is the present time, and ``horizon`` the time from now after which the list is no longer
+    valid. The bounds of blocks of ``2**shift`` entries are lowered where there are any. Pairs are
+    taken together, and the arithmetic has no branches, so that a processor vectorises it.
     """
     listed, calendar, bounds = pairs.listed, pairs.calendar, pairs.bounds
     flights, entries = pairs.flights, pairs.entries
@@ -68,7 +73,15 @@ def predict_contact_steps(count, t, earliest, horizon, shift, flow, grains, pair
             flights[4, n] = grains.constants[i, RADIUS] + grains.constants[j, RADIUS]
         for n in range((size + _TOGETHER - 1) // _TOGETHER * _TOGETHER):
             strikes, begins, ends = _contact_steps(
-                flights[0, n], flights[1, n], flights[2, n], flights[3, n], flights[4, n], t, earliest, horizon, flow
+                flights[0, n],
+                flights[1, n],
+                flights[2, n],
+                flights[3, n],
+                flights[4, n],
+                t,
+                earliest,
+                horizon,
+                flow,
             )
             entries[STRIKES, n], entries[BEGINS, n], entries[ENDS, n] = strikes, begins, ends
         for n in range(size):
@@ -88,13 +101,17 @@ def _contact_steps(dx, dy, ux, uy, reach, t, earliest, horizon, flow):
     speed, closing, excess = gap_coefficients(dx, dy, ux, uy, reach)
     discriminant = gap_discriminant(speed, closing, excess)
     root, per_speed = math.sqrt(discriminant if discriminant > 0.0 else 0.0), 1 / speed
-    turn = _as_step(first_step(t - closing * per_speed, dt, 0.0))  # the first step in which the pair recedes
+    turn = _as_step(
+        first_step(t - closing * per_speed, dt, 0.0)
+    )  # the first step in which the pair recedes
     enter = touching_time(closing, excess, root) if closing < 0.0 else -(root + closing) * per_speed
     begin = _as_step(first_step(t + enter, dt, theta))
     begin = begin if begin > earliest else earliest
     last = _as_step(np.floor((t + (root - closing) * per_speed) / dt - theta))
     last = last if last > turn - 1 else turn - 1
-    late = (excess > 0.0) & (excess + 2 * closing * horizon > 0.0)  # the gap does not close while the list is valid
+    late = (excess > 0.0) & (
+        excess + 2 * closing * horizon > 0.0
+    )  # the gap does not close while the list is valid
     meets = (discriminant >= 0.0) & (begin <= last) & (begin < MANY) & (speed != 0.0)
     rests = (speed == 0.0) & (excess <= 0.0)
     begin = begin if meets else (earliest if rests else _NEVER)
@@ -116,19 +133,27 @@ def _as_step(number):
 
 @inline_njit
 def clear_calendar(found, pairs):
-    """Pad the calendar behind the pairs found to whole ``LANES``; returns the number of its entries."""
+    """Pad the calendar behind the pairs found to whole ``LANES``; returns the number of its
+    entries.
+    """
     entries = (found + LANES - 1) // LANES * LANES
     for p in range(found, entries):
-        pairs.calendar[STRIKES, p], pairs.calendar[BEGINS, p], pairs.calendar[ENDS, p] = NEVER, NEVER, -1
+        pairs.calendar[STRIKES, p], pairs.calendar[BEGINS, p], pairs.calendar[ENDS, p] = (
+            NEVER,
+            NEVER,
+            -1,
+        )
     return entries
 
 
 @inline_njit
 def choose_blocks(entries, steps, pairs):
-    """The size of a block as a power of two, or 0 where it costs less to pass over all entries at each event.
+    """The size of a block as a power of two, or 0 where it costs less to pass over all entries at
+    each event.
 
-    An event passes over the bounds of all blocks, and each contact over the entries of two or three blocks. How many
-    contacts an event has follows from the strikes within the steps that the list will last.
+    An event passes over the bounds of all blocks, and each contact over the entries of two or three
+    blocks. How many contacts an event has follows from the strikes within the steps that the list
+    will last.
     """
     strikes = 0
     for p in range(entries):
@@ -144,14 +169,18 @@ def choose_blocks(entries, steps, pairs):
 
 @inline_njit
 def _pairs_of_block(b, entries, shift):
-    """The first pair of a block, unsigned so that loops over pairs vectorise, and the number of its pairs."""
+    """The first pair of a block, unsigned so that loops over pairs vectorise, and the number of its
+    pairs.
+    """
     first = min(b << shift, entries)
     return np.uint64(first), min(1 << shift, entries - first)
 
 
 @inline_njit
 def bound_blocks(entries, shift, pairs):
-    """Write the least strike and the least begin of each block; the bounds are padded to whole rows."""
+    """Write the least strike and the least begin of each block; the bounds are padded to whole
+    rows.
+    """
     calendar, bounds = pairs.calendar, pairs.bounds
     for b in range((_last_row(entries, shift) + 1) * _ROW):
         first, size = _pairs_of_block(b, entries, shift)
@@ -183,7 +212,9 @@ def next_contact_step(entries, shift, pairs):
 
 @inline_njit
 def _next_by_blocks(entries, shift, pairs):
-    """The same by the bounds of blocks: the least bound that is the strike of a pair; lower ones are renewed."""
+    """The same by the bounds of blocks: the least bound that is the strike of a pair; lower ones
+    are renewed.
+    """
     calendar, bounds = pairs.calendar, pairs.bounds
     rows = _last_row(entries, shift) + 1
     while True:
@@ -229,7 +260,9 @@ def contacts_of_step(k, entries, shift, pairs, met):
 
 @inline_njit
 def _contacts_by_blocks(k, entries, shift, pairs, met):
-    """The same by the bounds of blocks, which become those of the steps after ``k`` in the blocks that have begun."""
+    """The same by the bounds of blocks, which become those of the steps after ``k`` in the blocks
+    that have begun.
+    """
     calendar, bounds = pairs.calendar, pairs.bounds
     contacts, now = 0, np.int32(k)
     for row in range(_last_row(entries, shift) + 1):
@@ -247,7 +280,9 @@ def _contacts_by_blocks(k, entries, shift, pairs, met):
 
 @njit
 def _after(now, first, size, calendar):
-    """How many of ``size`` pairs are contacts in a step, and their least strike and begin after it."""
+    """How many of ``size`` pairs are contacts in a step, and their least strike and begin after
+    it.
+    """
     inside, strike, begin = 0, NEVER, NEVER
     for n in range(size):
         p = first + np.uint64(n)
@@ -260,7 +295,9 @@ def _after(now, first, size, calendar):
 
 @inline_njit
 def _contacts_among(first, size, now, contacts, pairs, met):
-    """Write the contacts among ``size`` pairs behind those found before; returns how many there are now."""
+    """Write the contacts among ``size`` pairs behind those found before; returns how many there are
+    now.
+    """
     calendar = pairs.calendar
     for n in range(size):
         p = first + np.uint64(n)

@@ -1,10 +1,12 @@
 """The impulses of one cluster of contacts, at restitution zero.
 
-Contacts are solved one after the other by projected Gauss–Seidel sweeps. Where these are slow (long chains, grains of
-very different mass, flows about to jam) the guarded method of Barzilai and Borwein continues from their result.
+Contacts are solved one after the other by projected Gauss–Seidel sweeps. Where these are slow (long
+chains, grains of very different mass, flows about to jam) the guarded method of Barzilai and
+Borwein continues from their result.
 
-Source: the sweeps are those of C. W. Cryer, SIAM J. Control 9, 385 (1971), and converge for semidefinite W by
-O. L. Mangasarian, J. Optim. Theory Appl. 22, 465 (1977). The other method: ``contact.projected_methods``.
+Source: the sweeps are those of C. W. Cryer, SIAM J. Control 9, 385 (1971), and converge for
+  semidefinite W by O. L. Mangasarian, J. Optim. Theory Appl. 22, 465 (1977). The other method:
+  ``contact.projected_methods``.
 """
 
 import math
@@ -42,10 +44,11 @@ from jaxgran.dynamics.numba_engine.layout import (
 largest_eigenvalue = LAW["largest_eigenvalue"]
 
 SWEEPS = 200  # after which a cluster counts as stiff
-# Contacts are taken from so many parts of a cluster in turn: those that follow each other share no grain, so that no
-# update waits for the one before it.
+# Contacts are taken from so many parts of a cluster in turn: those that follow each other share no
+# grain, so that no update waits for the one before it.
 _PARTS = 8
-# Over-relaxation by the number of contacts: within 0.05 of what needs fewest updates in clusters of 2 to 400 contacts.
+# Over-relaxation by the number of contacts: within 0.05 of what needs fewest updates in clusters of
+# 2 to 400 contacts.
 _RELAXATION = np.minimum(1 + 0.075 * np.log2(np.maximum(np.arange(641), 1)), 1.7)
 
 
@@ -53,8 +56,8 @@ _RELAXATION = np.minimum(1 + 0.075 * np.log2(np.maximum(np.arange(641), 1)), 1.7
 def solve_cluster(m, target, most_iterations, grains, network, clusters):
     """Write the impulses p₀ of cluster m at restitution zero.
 
-    ``target`` is the squared residual to reach. Returns the iterations, the squared residual, and ok, iteration_limit,
-    infeasible or nonfinite.
+    ``target`` is the squared residual to reach. Returns the iterations, the squared residual, and
+    ok, iteration_limit, infeasible or nonfinite.
     """
     rows, stiff, places, impulses = clusters.rows, clusters.stiff, clusters.places, network.rows
     start = clusters.starts[m]
@@ -66,7 +69,9 @@ def solve_cluster(m, target, most_iterations, grains, network, clusters):
         jammed = _is_jammed(size, clusters)
         if squared < math.inf and iterations < most_iterations:
             needed, squared = _descend(size, target, most_iterations - iterations, clusters)
-            jammed = _is_jammed(size, clusters)  # the last iterate: impulses of the best may not have grown yet
+            jammed = _is_jammed(
+                size, clusters
+            )  # the last iterate: impulses of the best may not have grown yet
             iterations += needed
             for c in range(size):
                 rows[c, P] = stiff[c, BEST]
@@ -81,7 +86,13 @@ def solve_cluster(m, target, most_iterations, grains, network, clusters):
 @inline_njit
 def _take_contacts(start, size, grains, network, clusters):
     """Copy the contacts of a cluster for the solver, one from each part of the cluster in turn."""
-    source, places, ends, rows, dv = clusters.source, clusters.places, clusters.ends, clusters.rows, clusters.dv
+    source, places, ends, rows, dv = (
+        clusters.source,
+        clusters.places,
+        clusters.ends,
+        clusters.rows,
+        clusters.dv,
+    )
     contacts, constants = network.rows, grains.constants
     one, last = np.uint64(1), np.uint64(start) + size
     length = size // np.uint64(_PARTS) + one if size >= 2 * _PARTS else one  # of a part
@@ -94,9 +105,16 @@ def _take_contacts(start, size, grains, network, clusters):
         mobility = mi + mj
         reduced_mass = 1 / mobility
         places[c], ends[c, FIRST], ends[c, SECOND] = place, i, j
-        rows[c, MU_NX], rows[c, MU_NY] = contacts[NX, place] * reduced_mass, contacts[NY, place] * reduced_mass
+        rows[c, MU_NX], rows[c, MU_NY] = (
+            contacts[NX, place] * reduced_mass,
+            contacts[NY, place] * reduced_mass,
+        )
         rows[c, MU_U], rows[c, INVERSE_MU] = contacts[APPROACH, place] * reduced_mass, mobility
-        rows[c, INVERSE_MU_MI], rows[c, INVERSE_MU_MJ], rows[c, P] = mobility * mi, mobility * mj, 0.0
+        rows[c, INVERSE_MU_MI], rows[c, INVERSE_MU_MJ], rows[c, P] = (
+            mobility * mi,
+            mobility * mj,
+            0.0,
+        )
         dv[i, 0] = dv[i, 1] = dv[j, 0] = dv[j, 1] = 0.0
         c += one
         n += length
@@ -107,7 +125,9 @@ def _take_contacts(start, size, grains, network, clusters):
 
 @njit
 def _is_jammed(size, clusters):
-    """Whether impulses have grown without moving anything: pᵀWp is far below −pᵀu⁻, which it is at a solution."""
+    """Whether impulses have grown without moving anything: pᵀWp is far below −pᵀu⁻, which it is at
+    a solution.
+    """
     rows, ends, dv = clusters.rows, clusters.ends, clusters.dv
     moved = felt = 0.0
     for c in range(size):
@@ -120,10 +140,12 @@ def _is_jammed(size, clusters):
 
 @inline_njit
 def _sweep(size, target, most_sweeps, clusters):
-    """Projected Gauss–Seidel sweeps with over-relaxation; returns their number and the squared residual.
+    """Projected Gauss–Seidel sweeps with over-relaxation; returns their number and the squared
+    residual.
 
-    The update of a contact, without relaxation and over its reduced mass, is its residual min(W_cc p, u), so a sweep
-    estimates the norm at no cost; the norm of a single state decides. ``dv`` are the changes of the grains' velocities.
+    The update of a contact, without relaxation and over its reduced mass, is its residual min(W_cc
+    p, u), so a sweep estimates the norm at no cost; the norm of a single state decides. ``dv`` are
+    the changes of the grains' velocities.
     """
     rows, ends, dv = clusters.rows, clusters.ends, clusters.dv
     relaxation = _RELAXATION[min(size, np.uint64(_RELAXATION.size - 1))]
@@ -147,7 +169,9 @@ def _sweep(size, target, most_sweeps, clusters):
             squared = 0.0
             for c in range(size):
                 i, j = ends[c, FIRST], ends[c, SECOND]
-                fall = rows[c, MU_NX] * (dv[j, 0] - dv[i, 0]) + rows[c, MU_NY] * (dv[j, 1] - dv[i, 1])
+                fall = rows[c, MU_NX] * (dv[j, 0] - dv[i, 0]) + rows[c, MU_NY] * (
+                    dv[j, 1] - dv[i, 1]
+                )
                 error = min(rows[c, P], rows[c, MU_U] - fall) * rows[c, INVERSE_MU]
                 squared += error * error
             going &= not squared <= target
@@ -158,9 +182,16 @@ def _sweep(size, target, most_sweeps, clusters):
 def _descend(size, target, most_iterations, clusters):
     """The guarded method of Barzilai and Borwein, from the impulses where the sweeps ended.
 
-    Returns the products with W and the squared residual of the best iterate, whose impulses are in ``stiff``.
+    Returns the products with W and the squared residual of the best iterate, whose impulses are in
+    ``stiff``.
     """
-    rows, stiff, ends, dv, matrices = clusters.rows, clusters.stiff, clusters.ends, clusters.dv, clusters.matrices
+    rows, stiff, ends, dv, matrices = (
+        clusters.rows,
+        clusters.stiff,
+        clusters.ends,
+        clusters.dv,
+        clusters.matrices,
+    )
     for c in range(size):
         for end in range(2):
             matrices[ends[c, end], 0] = matrices[ends[c, end], 1] = matrices[ends[c, end], 2] = 0.0
@@ -179,17 +210,26 @@ def _descend(size, target, most_iterations, clusters):
         width_i = largest_eigenvalue(matrices[i, 0], matrices[i, 1], matrices[i, 2])
         width_j = largest_eigenvalue(matrices[j, 0], matrices[j, 1], matrices[j, 2])
         bound = width_i * inverse_mass_i + width_j * inverse_mass_j
-        stiff[c, BOUND], stiff[c, STEP], stiff[c, CHANGE], stiff[c, BEST] = bound, 0.0, 0.0, rows[c, P]
+        stiff[c, BOUND], stiff[c, STEP], stiff[c, CHANGE], stiff[c, BEST] = (
+            bound,
+            0.0,
+            0.0,
+            rows[c, P],
+        )
         stiff[c, RESPONSE] = nx * (dv[i, 0] - dv[j, 0]) + ny * (dv[i, 1] - dv[j, 1])
     stride, momentum, before, best, squared = 1.0, -1, math.inf, math.inf, math.inf
     iterations = 0
-    while iterations == 0 or (iterations < most_iterations and not squared <= target and squared < math.inf):
+    while iterations == 0 or (
+        iterations < most_iterations and not squared <= target and squared < math.inf
+    ):
         push, descent = max(momentum, 0) / (max(momentum, 0) + 3.0), 0.0
         for c in range(size):
             i, j = ends[c, FIRST], ends[c, SECOND]
             old, bound = rows[c, P], stiff[c, BOUND]
             at = old + push * stiff[c, STEP]
-            slope = stiff[c, RESPONSE] + push * stiff[c, CHANGE] + rows[c, MU_U] * rows[c, INVERSE_MU]
+            slope = (
+                stiff[c, RESPONSE] + push * stiff[c, CHANGE] + rows[c, MU_U] * rows[c, INVERSE_MU]
+            )
             new = max(0.0, at - stride * slope / bound)
             descent += (at - new) * (new - old) * bound
             stiff[c, STEP] = new - old

@@ -14,11 +14,13 @@ from jaxgran.contact import law
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract"},
-    "_nrt": False,  # private, but no public option leaves out the calls into numba's runtime, which is not loaded
+    # private, but no public option leaves out the calls into numba's runtime, which is not loaded
+    "_nrt": False,
     "no_cpython_wrapper": True,  # nothing here is called from Python
     "no_cfunc_wrapper": True,
 }
-# Structures of arrays are passed by value, some hundred words a call, so functions of every step are inlined.
+# Structures of arrays are passed by value, some hundred words a call, so functions of every step
+# are inlined.
 inline_njit: Callable[[Callable], Any] = numba.njit(forceinline=True, **OPTIONS)
 njit: Callable[[Callable], Any] = numba.njit(**OPTIONS)  # functions that are seldom called
 
@@ -34,10 +36,20 @@ def _maximum(a, b):
 
 
 def _compiled_law(module: ModuleType) -> dict[str, Any]:
-    """The functions of a module that is written for arrays of JAX, compiled for numbers from the same source."""
-    names: dict[str, Any] = {**vars(module), "where": _where, "maximum": _maximum, "sqrt": math.sqrt, "ceil": np.ceil}
+    """The functions of a module that is written for arrays of JAX, compiled for numbers from the
+    same source.
+    """
+    names: dict[str, Any] = {
+        **vars(module),
+        "where": _where,
+        "maximum": _maximum,
+        "sqrt": math.sqrt,
+        "ceil": np.ceil,
+    }
     functions = {
-        name: f for name, f in inspect.getmembers(module, inspect.isfunction) if f.__module__ == module.__name__
+        name: f
+        for name, f in inspect.getmembers(module, inspect.isfunction)
+        if f.__module__ == module.__name__
     }
     for name, function in functions.items():
         names[name] = inline_njit(FunctionType(function.__code__, names, name))

@@ -1,8 +1,10 @@
-"""Loads the numba engine from an object file, compiles it if there is none, and registers it with XLA.
+"""Loads the numba engine from an object file, compiles it if there is none, and registers it with
+XLA.
 
-The name of the file is a hash of all that its content depends on: the sources of its folders, the compiler
-and the processor. So a change in any of them gives another file, in a user's cache and in the tests. An object file is
-loaded without importing numba. If the cache cannot be written, every process compiles, with a warning.
+The name of the file is a hash of all that its content depends on: the sources of its folders, the
+compiler and the processor. So a change in any of them gives another file, in a user's cache and in
+the tests. An object file is loaded without importing numba. If the cache cannot be written, every
+process compiles, with a warning.
 """
 
 import ctypes
@@ -26,21 +28,34 @@ from jaxgran.model.checks import InputError
 
 TARGET = "jaxgran_advance"
 STOP = "jaxgran_stop"  # a word in the object file; the engine runs while it is zero
-THREADS = "jaxgran_threads"  # a word in the object file: threads that advance the replicas of a call
+THREADS = (
+    "jaxgran_threads"  # a word in the object file: threads that advance the replicas of a call
+)
 _LOCK = Lock()
 _MOST_KEPT = 8  # object files in the cache
 _CACHE_FOLDER = "NUMBA_CACHE_DIR"  # environment variable, honoured as numba does
 
 
 def sources() -> list[Path]:
-    """The files on which the machine code may depend: all of ``dynamics``, and of the folders that it may import."""
+    """The files on which the machine code may depend: all of ``dynamics``, and of the folders that
+    it may import.
+    """
     package = Path(__file__).parents[2]
-    return sorted(path for folder in ("contact", "dynamics", "model") for path in (package / folder).rglob("*.py"))
+    return sorted(
+        path
+        for folder in ("contact", "dynamics", "model")
+        for path in (package / folder).rglob("*.py")
+    )
 
 
 def object_file() -> Path:
     """Path of the object file: in the cache folder, or in that of numba's environment variable."""
-    words = [version("numba"), version("llvmlite"), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()]
+    words = [
+        version("numba"),
+        version("llvmlite"),
+        llvm.get_host_cpu_name(),
+        llvm.get_host_cpu_features().flatten(),
+    ]
     digest = hashlib.sha256("\n".join([*words, os.environ.get("NUMBA_OPT", "")]).encode())
     for path in sources():
         digest.update(path.read_bytes())
@@ -52,7 +67,8 @@ def register() -> None:
     """Load the numba engine, or compile it, and register it with XLA; once in a process.
 
     Raises:
-      InputError: this jaxlib does not support the version of the foreign function interface that the engine reads.
+      InputError: this jaxlib does not support the version of the foreign function interface that
+        the engine reads.
     """
     with _LOCK:
         _register()
@@ -76,9 +92,13 @@ def _register() -> None:
     _ENGINES.append(engine)
     set_word(THREADS, usable_threads())
     try:
-        jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(engine.get_function_address(TARGET)), platform="cpu")
+        jax.ffi.register_ffi_target(
+            TARGET, jax.ffi.pycapsule(engine.get_function_address(TARGET)), platform="cpu"
+        )
     except jax.errors.JaxRuntimeError as error:
-        raise InputError(f"engine must be jax with jaxlib {version('jaxlib')}, not numba: {error}") from error
+        raise InputError(
+            f"engine must be jax with jaxlib {version('jaxlib')}, not numba: {error}"
+        ) from error
 
 
 def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
@@ -91,7 +111,8 @@ def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
     except OSError as error:
         warnings.warn(
             "the numba engine is compiled anew in every process, in about 15 s: the cache folder "
-            f"{str(path.parent)!r} cannot be written ({error.strerror}); set XDG_CACHE_HOME or {_CACHE_FOLDER} to "
+            f"{str(path.parent)!r} cannot be written ({error.strerror}); set XDG_CACHE_HOME or "
+            f"{_CACHE_FOLDER} to "
             "one that can.",
             stacklevel=3,
         )

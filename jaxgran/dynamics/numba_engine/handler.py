@@ -1,8 +1,9 @@
 """The function that XLA calls, and its compilation. Only this file knows XLA's binary interface.
 
-It reads version 0.2 of the C interface of XLA's foreign functions, ``xla/ffi/api/c_api.h`` in the folder
-``jax.ffi.include_dir()``. ``jax.ffi`` registers the address of a compiled function, which must decode this interface
-itself; the decoder that comes with jaxlib needs a C++ compiler. Structures are read in words of eight bytes:
+It reads version 0.2 of the C interface of XLA's foreign functions, ``xla/ffi/api/c_api.h`` in the
+folder ``jax.ffi.include_dir()``. ``jax.ffi`` registers the address of a compiled function, which
+must decode this interface itself; the decoder that comes with jaxlib needs a C++ compiler.
+Structures are read in words of eight bytes:
 
 ==============================  ========================================================
 structure                       words
@@ -14,12 +15,13 @@ structure                       words
 ``XLA_FFI_Metadata``            3 api_version: major in the lower half, minor in the upper
 ==============================  ========================================================
 
-These words are the same in versions 0.2 to 0.4, which jaxlib 0.9 to 0.11 speak. When the function is registered, XLA
-calls it with a metadata extension, and asks for the version that it was written for. XLA refuses one that it no longer
-supports, and then `ffi.register` raises an InputError.
+These words are the same in versions 0.2 to 0.4, which jaxlib 0.9 to 0.11 speak. When the function
+is registered, XLA calls it with a metadata extension, and asks for the version that it was written
+for. XLA refuses one that it no longer supports, and then `ffi.register` raises an InputError.
 
-A batch comes whole, with leading axes of replicas in all buffers. Threads of the operating system take one replica
-after another. The thread that XLA calls is one of them, and no thread outlives the call.
+A batch comes whole, with leading axes of replicas in all buffers. Threads of the operating system
+take one replica after another. The thread that XLA calls is one of them, and no thread outlives the
+call.
 """
 
 import os
@@ -30,7 +32,14 @@ from numba import types
 
 from jaxgran.dynamics.numba_engine.allocation import arrays_of, doubles_at, integers_at
 from jaxgran.dynamics.numba_engine.compilation import OPTIONS, inline_njit
-from jaxgran.dynamics.numba_engine.layout import CAPACITY, INPUTS, RESULTS, STATUS, WORDS, WORDS_PER_GRAIN
+from jaxgran.dynamics.numba_engine.layout import (
+    CAPACITY,
+    INPUTS,
+    RESULTS,
+    STATUS,
+    WORDS,
+    WORDS_PER_GRAIN,
+)
 from jaxgran.dynamics.numba_engine.loop import advance_loop
 
 API_MAJOR, API_MINOR = 0, 2
@@ -43,7 +52,8 @@ _METADATA_EXTENSION = 1  # type of the extension that asks for the metadata
 _COUNT = -1  # asks the handler for the number of replicas
 
 # numba returns through a pointer, and passes exceptions through another; nothing here raises one.
-# The job of the threads of a call: its frame, its number of replicas, and the next replica that no thread has taken.
+# The job of the threads of a call: its frame, its number of replicas, and the next replica that no
+# thread has taken.
 _ENTRY = """
 @STOP = global i64 0
 @THREADS = global i64 1
@@ -51,7 +61,8 @@ _ENTRY = """
 define internal i64 @handle(i64 %frame, i64 %replica) {
   %result = alloca i64
   %exception = alloca ptr
-  call i32 @COMPILED(ptr %result, ptr %exception, i64 %frame, i64 %replica, i64 ptrtoint (ptr @STOP to i64))
+  call i32 @COMPILED(ptr %result, ptr %exception, i64 %frame, i64 %replica,
+                     i64 ptrtoint (ptr @STOP to i64))
   %returned = load i64, ptr %result
   ret i64 %returned
 }
@@ -123,7 +134,9 @@ declare i32 @pthread_create(ptr, ptr, ptr, ptr)
 declare i32 @pthread_join(i64, ptr)
 """
 _OTHER = """
-define internal i32 @pthread_create(ptr %handle, ptr %attributes, ptr %function, ptr %argument) { ret i32 1 }
+define internal i32 @pthread_create(ptr %handle, ptr %attributes, ptr %function, ptr %argument) {
+  ret i32 1
+}
 define internal i32 @pthread_join(i64 %handle, ptr %result) { ret i32 1 }
 """
 _allocate = types.ExternalFunction("malloc", types.int64(types.int64))
@@ -159,9 +172,11 @@ def _replicas(buffers, k):
 
 
 def _handler(frame, replica, stop):
-    """Call ``advance_loop`` with the buffers of a replica of a call frame; ``stop`` is the address of a word.
+    """Call ``advance_loop`` with the buffers of a replica of a call frame; ``stop`` is the address
+    of a word.
 
-    Returns 0; for the replica ``_COUNT`` the number of replicas, which is 0 where XLA asks for the version.
+    Returns 0; for the replica ``_COUNT`` the number of replicas, which is 0 where XLA asks for the
+    version.
     """
     extension = _word(frame, EXTENSION_START)
     if extension != 0 and _word(extension, _TYPE) & 0xFFFFFFFF == _METADATA_EXTENSION:
@@ -229,7 +244,13 @@ def object_code(symbol: str, stop: str, threads: str, machine: llvm.TargetMachin
     (kept,) = made.overloads.values()
     (code,) = made.inspect_llvm().values()
     entry = _ENTRY + (_POSIX if os.name == "posix" else _OTHER)
-    names = {"SYMBOL": symbol, "STOP": stop, "THREADS": threads, "COUNT": _COUNT, "COMPILED": kept.fndesc.mangled_name}
+    names = {
+        "SYMBOL": symbol,
+        "STOP": stop,
+        "THREADS": threads,
+        "COUNT": _COUNT,
+        "COMPILED": kept.fndesc.mangled_name,
+    }
     for name, value in names.items():
         entry = entry.replace(name, str(value))
     module = llvm.parse_assembly(code + entry)

@@ -5,9 +5,21 @@ import math
 import numpy as np
 
 from jaxgran.dynamics.numba_engine.compilation import inline_njit, njit
-from jaxgran.dynamics.numba_engine.layout import ACROSS, FIRST, INVERSE_MASS, RADIUS, ROW, SECOND, VX, VY, X, Y
+from jaxgran.dynamics.numba_engine.layout import (
+    ACROSS,
+    FIRST,
+    INVERSE_MASS,
+    RADIUS,
+    ROW,
+    SECOND,
+    VX,
+    VY,
+    X,
+    Y,
+)
 
-LIFE = 0.1  # strain: the longest life of a list, in which a peculiar speed grows by a factor of 1.1 at most
+# strain: the longest life of a list, in which a peculiar speed grows by a factor of 1.1 at most
+LIFE = 0.1
 _ATTEMPTS = 12  # with ever narrower skins, while a list has more pairs than room
 _CACHED_GRAINS, _ROW_HEIGHT = 2000, 2.0  # larger flows are put in order, in cells of two diameters
 
@@ -20,9 +32,13 @@ def skin_loss(fastest, rate, distance):
 
 @njit
 def put_in_order(positions, side, tilt, order):
-    """Write an order of the grains, row by row, that keeps neighbours close in memory if a flow outgrows the caches."""
+    """Write an order of the grains, row by row, that keeps neighbours close in memory if a flow
+    outgrows the caches.
+    """
     given, cells, starts, count = order.given, order.cells, order.starts, order.given.size
-    across = int(max(1.0, min(math.sqrt(count), side / _ROW_HEIGHT))) if count > _CACHED_GRAINS else 1
+    across = (
+        int(max(1.0, min(math.sqrt(count), side / _ROW_HEIGHT))) if count > _CACHED_GRAINS else 1
+    )
     for c in range(across * across + 1):
         starts[c] = 0
     for g in range(count):
@@ -42,7 +58,9 @@ def put_in_order(positions, side, tilt, order):
 
 @inline_njit
 def bring_into_cell(grains, side, tilt, rate):
-    """Bring the grains into the cell, at the same peculiar velocities; returns the largest peculiar speed."""
+    """Bring the grains into the cell, at the same peculiar velocities; returns the largest peculiar
+    speed.
+    """
     motion = grains.motion
     fastest = 0.0
     for g in range(motion.shape[0]):
@@ -58,7 +76,8 @@ def bring_into_cell(grains, side, tilt, rate):
 
 @njit
 def search(grains, pairs, side, tilt, largest, skin):
-    """Write the pairs with a gap within a skin, which is narrowed until there is room for all of them.
+    """Write the pairs with a gap within a skin, which is narrowed until there is room for all of
+    them.
 
     Returns their number, the skin, and whether there was room.
     """
@@ -76,9 +95,14 @@ def search(grains, pairs, side, tilt, largest, skin):
 
 @njit
 def find_near_pairs(grains, pairs, side, tilt, reach, skin, room):
-    """Write the pairs with a gap within the skin, and their images; pairs beyond the room are counted, not written."""
+    """Write the pairs with a gap within the skin, and their images; pairs beyond the room are
+    counted, not written.
+    """
     most = math.sqrt(pairs.starts.size - 1)
-    up, along = int(min(most, side / reach)), int(min(most, side / (reach * math.sqrt(1.0 + tilt * tilt))))
+    up, along = (
+        int(min(most, side / reach)),
+        int(min(most, side / (reach * math.sqrt(1.0 + tilt * tilt)))),
+    )
     if up >= 3 and along >= 3:
         _sort_into_cells(grains, pairs, side, tilt, up, along)
         return _pairs_of_cells(pairs, side, tilt, up, along, skin, room)
@@ -87,7 +111,9 @@ def find_near_pairs(grains, pairs, side, tilt, reach, skin, room):
 
 @inline_njit
 def _sort_into_cells(grains, pairs, side, tilt, up, along):
-    """Sort the grains into cells row by row, those of a cell at ``starts[cell] : starts[cell + 1]``."""
+    """Sort the grains into cells row by row, those of a cell at ``starts[cell] : starts[cell +
+    1]``.
+    """
     motion, constants = grains.motion, grains.constants
     starts, cells, sorted_grains, places = pairs.starts, pairs.cells, pairs.sorted, pairs.places
     for cell in range(up * along + 1):
@@ -99,7 +125,9 @@ def _sort_into_cells(grains, pairs, side, tilt, up, along):
         starts[cells[g] + 1] += 1
     for cell in range(up * along):
         starts[cell + 1] += starts[cell]
-    for g in range(motion.shape[0] - 1, -1, -1):  # a cell is filled from its end, which moves to its beginning
+    for g in range(
+        motion.shape[0] - 1, -1, -1
+    ):  # a cell is filled from its end, which moves to its beginning
         starts[cells[g] + 1] -= 1
         n = starts[cells[g] + 1]
         sorted_grains[n] = g
@@ -127,18 +155,33 @@ def _pairs_of_cells(pairs, side, tilt, up, along, skin, room):
             elif part == 1 and column + 1 == along:
                 begin, end, across = starts[row * along], starts[row * along + 1], 1
             elif part == 2:
-                begin, end = starts[above + max(column - 1, 0)], starts[above + min(column + 2, along)]
+                begin, end = (
+                    starts[above + max(column - 1, 0)],
+                    starts[above + min(column + 2, along)],
+                )
                 lift = over
             elif part == 3 and column == 0:
-                begin, end, across, lift = starts[above + along - 1], starts[above + along], -1, over
+                begin, end, across, lift = (
+                    starts[above + along - 1],
+                    starts[above + along],
+                    -1,
+                    over,
+                )
             elif part == 3 and column + 1 == along:
                 begin, end, across, lift = starts[above], starts[above + 1], 1, over
             shift, rise = (across + lift * tilt) * side, lift * side
             for m in range(starts[cell], starts[cell + 1]):
-                i, x, y, width = sorted_grains[m], places[0, m] - shift, places[1, m] - rise, places[2, m] + skin
+                i, x, y, width = (
+                    sorted_grains[m],
+                    places[0, m] - shift,
+                    places[1, m] - rise,
+                    places[2, m] + skin,
+                )
                 for n in range(m + 1 if part == 0 else begin, end):
                     dx, dy, limit = x - places[0, n], y - places[1, n], width + places[2, n]
-                    at = np.uint64(min(found, room))  # without a branch, which would be mispredicted
+                    at = np.uint64(
+                        min(found, room)
+                    )  # without a branch, which would be mispredicted
                     ends[FIRST, at], ends[SECOND, at] = i, sorted_grains[n]
                     images[ACROSS, at], images[ROW, at] = shift, lift
                     found += dx * dx + dy * dy <= limit * limit
@@ -192,7 +235,11 @@ def kinetic_sums(grains, rate):
     motion, constants = grains.motion, grains.constants
     xx = xy = yy = 0.0
     for g in range(motion.shape[0]):
-        cx, cy, mass = motion[g, VX] - rate * motion[g, Y], motion[g, VY], 1 / constants[g, INVERSE_MASS]
+        cx, cy, mass = (
+            motion[g, VX] - rate * motion[g, Y],
+            motion[g, VY],
+            1 / constants[g, INVERSE_MASS],
+        )
         xx += mass * cx * cx
         xy += mass * cx * cy
         yy += mass * cy * cy

@@ -21,8 +21,16 @@ from jaxgran.dynamics.numba_engine.layout import (
 
 @inline_njit
 def make_network(contacts, t, flow, grains, pairs, network):
-    """Write the contacts of a step and their grains; returns their number, Σ min(0, u⁻)² and the deepest overlap."""
-    met, ends, rows, degree, touched = network.met, network.ends, network.rows, network.degree, network.touched
+    """Write the contacts of a step and their grains; returns their number, Σ min(0, u⁻)² and the
+    deepest overlap.
+    """
+    met, ends, rows, degree, touched = (
+        network.met,
+        network.ends,
+        network.rows,
+        network.degree,
+        network.touched,
+    )
     constants = grains.constants
     hits, scale, deepest = 0, 0.0, 0.0
     for c in range(contacts):
@@ -61,12 +69,18 @@ def solve_isolated(contacts, grains, network):
 
 @inline_njit
 def find_clusters(contacts, hits, network, clusters):
-    """Find the clusters in which a contact approaches, each by a breadth-first search from such a contact.
+    """Find the clusters in which a contact approaches, each by a breadth-first search from such a
+    contact.
 
     Returns their number; the contacts of cluster m are ``source[starts[m] : starts[m + 1]]``.
     """
     ends, rows, degree, touched = network.ends, network.rows, network.degree, network.touched
-    source, starts, queue, reached = clusters.source, clusters.starts, clusters.queue, clusters.reached
+    source, starts, queue, reached = (
+        clusters.source,
+        clusters.starts,
+        clusters.queue,
+        clusters.reached,
+    )
     of_grain, offsets = clusters.of_grain, clusters.offsets
     total = 0
     for h in range(hits):
@@ -107,7 +121,13 @@ def find_clusters(contacts, hits, network, clusters):
 @inline_njit
 def gather_kicks(contacts, hits, one_plus_alpha, network):
     """Add up the impulses on every grain, and its contacts that carry one."""
-    ends, rows, touched, kicks, loaded = network.ends, network.rows, network.touched, network.kicks, network.loaded
+    ends, rows, touched, kicks, loaded = (
+        network.ends,
+        network.rows,
+        network.touched,
+        network.kicks,
+        network.loaded,
+    )
     for h in range(hits):
         kicks[touched[h], 0] = kicks[touched[h], 1] = 0.0
     for c in range(contacts):

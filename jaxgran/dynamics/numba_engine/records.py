@@ -1,9 +1,11 @@
-"""Records of the visited steps, for a user's functions: the grains, and the contacts with their impulses.
+"""Records of the visited steps, for a user's functions: the grains, and the contacts with their
+impulses.
 
-A record is a row of numbers: its step, whether contacts act in it, how many there are, and the tilt; then x, y, c_x and
-c_y of every grain before the contacts act; then i, j, n_x, n_y, u, distance and impulse of every contact. Positions are
-not wrapped. A list of near pairs, and a call that continues with one, begin with a record without contacts. So every
-flight is recorded within the life of a list.
+A record is a row of numbers: its step, whether contacts act in it, how many there are, and the
+  tilt; then x, y, c_x and c_y of every grain before the contacts act; then i, j, n_x, n_y, u,
+  distance and impulse of every contact. Positions are not wrapped. A list of near pairs, and a call
+  that continues with one, begin with a record without contacts. So every flight is recorded within
+  the life of a list.
 """
 
 import math
@@ -33,7 +35,9 @@ from jaxgran.dynamics.numba_engine.layout import (
 
 @njit
 def record_flight(record, step, acted, tilt, t, rate, grains, places):
-    """Record the grains at the time t since the search, without contacts; ``acted``: whether those have been."""
+    """Record the grains at the time t since the search, without contacts; ``acted``: whether those
+    have been.
+    """
     motion = grains.motion
     record[AT_STEP], record[ACTED], record[CONTACTS] = step, acted, 0.0
     record[TILTED] = tilt - math.floor(tilt + 0.5)

@@ -1,4 +1,6 @@
-"""The running sums of the numba engine, in one row of numbers ordered by the table of ``dynamics.tally``."""
+"""The running sums of the numba engine, in one row of numbers ordered by the table of
+``dynamics.tally``.
+"""
 
 from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit
 from jaxgran.dynamics.numba_engine.layout import (
@@ -19,11 +21,14 @@ contact_terms, kinetic_means = LAW["contact_terms"], LAW["kinetic_means"]
 
 _FIRST_TERM, _TERMS = span_of(CONTACT).start, span_of(CONTACT).stop - span_of(CONTACT).start
 _PADDED = (_TERMS + 7) // 8 * 8  # the terms are added eight at a time
-# Terms that fill the last eight, and are added to nothing: zeros in their place cost 3 to 6 % of a step.
+# Terms that fill the last eight, and are added to nothing: zeros in their place cost 3 to 6 % of a
+# step.
 _PADS = _PADDED - _TERMS
 _DURATION, _STEPS, _KINETIC = place_of("duration"), place_of("steps"), place_of("kinetic_moment")
 COLLISIONS = place_of("collisions")
-_SOLVES, _ITERATIONS, _UNCONVERGED = (place_of(name) for name in ("solves", "iterations", "unconverged"))
+_SOLVES, _ITERATIONS, _UNCONVERGED = (
+    place_of(name) for name in ("solves", "iterations", "unconverged")
+)
 _LARGEST_OVERLAP, _WORST_RESIDUAL = place_of("largest_overlap"), place_of("worst_residual")
 
 
@@ -45,8 +50,16 @@ def add_flight(sums, steps, flight, strain, kinetic):
 
 @inline_njit
 def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
-    """Add what the contacts of one step contribute, by the law of a contact; ``step_sums`` is memory for it."""
-    ends, rows, kicks, loaded, constants = network.ends, network.rows, network.kicks, network.loaded, grains.constants
+    """Add what the contacts of one step contribute, by the law of a contact; ``step_sums`` is
+    memory for it.
+    """
+    ends, rows, kicks, loaded, constants = (
+        network.ends,
+        network.rows,
+        network.kicks,
+        network.loaded,
+        grains.constants,
+    )
     for n in range(_PADDED):
         step_sums[n] = 0.0
     for c in range(contacts):
@@ -54,7 +67,9 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
         nx, ny, approach, distance = rows[NX, c], rows[NY, c], rows[APPROACH, c], rows[DISTANCE, c]
         mi, mj = constants[i, INVERSE_MASS], constants[j, INVERSE_MASS]
         impulse = one_plus_alpha * rows[IMPULSE, c]
-        change = nx * (kicks[i, 0] * mi - kicks[j, 0] * mj) + ny * (kicks[i, 1] * mi - kicks[j, 1] * mj)
+        change = nx * (kicks[i, 0] * mi - kicks[j, 0] * mj) + ny * (
+            kicks[i, 1] * mi - kicks[j, 1] * mj
+        )
         terms = contact_terms(
             nx,
             ny,

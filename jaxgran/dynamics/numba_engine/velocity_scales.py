@@ -16,7 +16,8 @@ _AMPLITUDES = 4 * len(WAVES)  # real and imaginary parts of both components
 
 @njit
 def read_velocity_scales(t, tilt, side, rate, grains, boxes, amplitudes, results):
-    """Add a reading of the state at the time t since the search, which stands for the time since the last reading.
+    """Add a reading of the state at the time t since the search, which stands for the time since
+    the last reading.
 
     Args:
       t, tilt, side, rate: the time, tilt and side of the cell then, and the shear rate.
