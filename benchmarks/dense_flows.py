@@ -2,10 +2,10 @@
 jamming at about 0.84.
 
 A map refuses them: fewer grains often cannot be packed there, since the packing fraction at which
-  they jam scatters. Every flow is packed, sheared from rest at dt = 1e-4 and at its own dt, and
-  sampled, α = 0.2, midpoint rule; its energy is dissipated and supplied anew within a strain of
-  some hundredths. It is written when it is done, so a study that was stopped goes on where it was,
-  at the same commit. ``dense_limit`` fits these flows together with those of ``dense_rheology``.
+they jam scatters. Every flow is packed, sheared from rest at dt = 1e-4 and at its own dt, and
+sampled, α = 0.2, midpoint rule; its energy is dissipated and supplied anew within a strain of some
+hundredths. It is written when it is done, so a study that was stopped goes on where it was, at the
+same commit. ``dense_limit`` fits these flows together with those of ``dense_rheology``.
 
     python -m benchmarks dense_flows           # an hour on one core
     python -m benchmarks dense_flows --quick   # one flow of 256 grains, a minute

@@ -11,9 +11,8 @@ Then the intervals are judged: on points of the map that are left out, and on th
 ``python -m benchmarks reference_runs``. The maps of the paper and of a coarse time step give the
 force ratio at other time steps.
 
-    python -m benchmarks reference              # from benchmarks/results/reference.nc, in two
-    minutes python -m benchmarks reference --quick      # into files named _quick and a folder of
-    the output
+    python -m benchmarks reference          # from benchmarks/results/reference.nc, in two minutes
+    python -m benchmarks reference --quick  # into files named _quick and a folder of the output
 """
 
 import json

@@ -8,12 +8,12 @@ So a run that was stopped goes on, and another seed makes all errors smaller. Fl
 say how averages approach those of a large system (``python -m benchmarks size_limits``), and a map
 at dt = 1e-3 what becomes of the force ratio.
 
-    python -m benchmarks reference_map                 # two hours on two cores python -m benchmarks
-    reference_map --seeds 4       # two seeds more python -m benchmarks reference_map --part sizes
-    # 9 loose flows of up to 25,600 grains, 12 dense ones python -m benchmarks reference_map --part
-    large    # one flow of 102,400 grains, half an hour python -m benchmarks reference_map --part
-    coarse   # dt = 1e-3 python -m benchmarks reference_map --quick         # a plane of 3 × 3
-    points, 64 and 100 grains, a minute
+    python -m benchmarks reference_map               # two hours on two cores
+    python -m benchmarks reference_map --seeds 4     # two seeds more
+    python -m benchmarks reference_map --part sizes  # flows of several sizes
+    python -m benchmarks reference_map --part large  # one flow of 102,400 grains, half an hour
+    python -m benchmarks reference_map --part coarse  # dt = 1e-3
+    python -m benchmarks reference_map --quick       # 3 × 3 points of 64 and 100 grains, a minute
 """
 
 from pathlib import Path

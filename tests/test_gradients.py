@@ -65,13 +65,17 @@ def inputs(network: Contacts, masses: np.ndarray):
 
 
 def strictness(network: Contacts, masses: np.ndarray) -> float:
-    """How far the network is from a contact that neither presses nor parts."""
+    """How far the network is from a contact that neither presses nor parts, or, if that is less,
+    from impulses that are not unique: the smallest eigenvalue of the block of pressing contacts.
+    """
     impulses = np.asarray(impulses_of(*inputs(network, masses), network))
     matrix = delassus(network, masses)
     margin = np.maximum(
         np.diag(matrix) * impulses, matrix @ impulses + np.asarray(network.approach)
     )
-    return float(np.min(margin[np.asarray(network.used)]))
+    presses = (impulses > 0) & np.asarray(network.used)
+    eigenvalues = np.linalg.eigvalsh(matrix[np.ix_(presses, presses)])
+    return float(np.min(np.append(margin[np.asarray(network.used)], eigenvalues)))
 
 
 @settings(max_examples=25, phases=[Phase.generate])

@@ -21,8 +21,8 @@ never jumps over free flight; everything else is made to be fast:
   all grains.
 
 Axes: positions and velocities are ``(grains, 2)``, radii and masses ``(grains,)``. Velocities are
-  peculiar: the laboratory velocity is ``velocity + shear_rate * y`` along x. The periodic cell has
-  the lattice vectors ``(side, 0)`` and ``(tilt * side, side)``, tilt in [-1/2, 1/2).
+peculiar: the laboratory velocity is ``velocity + shear_rate * y`` along x. The periodic cell has
+the lattice vectors ``(side, 0)`` and ``(tilt * side, side)``, tilt in [-1/2, 1/2).
 """
 
 from __future__ import annotations

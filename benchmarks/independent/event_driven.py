@@ -10,9 +10,9 @@ Luding and S. McNamara, Granular Matter 1, 113, 1998). So collisions that follow
 energy, and no inelastic collapse can last. At t_c = 0 these are inelastic hard discs.
 
 How it works: near pairs are found with a cell list. The list stands until discs may have approached
-  by more than its skin. The next collisions of near pairs stand in a heap. A stamp of each disc
-  changes when it collides, and events with an old stamp are dropped. The periodic cell is sheared
-  (Lees and Edwards): the image row above moves with γ̇L.
+by more than its skin. The next collisions of near pairs stand in a heap. A stamp of each disc
+changes when it collides, and events with an old stamp are dropped. The periodic cell is sheared
+(Lees and Edwards): the image row above moves with γ̇L.
 
 Units are those of jaxgran: mean diameter σ, mass of a mean grain m, and 1/γ̇.
 """

@@ -2,8 +2,8 @@
 law of soft discs.
 
 Units as in jaxgran: lengths in mean diameters, masses in that of a mean disc (m = d²), times in
-  1/shear rate. Velocities are peculiar, the laboratory's are ``velocity + shear_rate * y`` along x.
-  The cell has the lattice vectors (side, 0) and (tilt · side, side).
+1/shear rate. Velocities are peculiar, the laboratory's are ``velocity + shear_rate * y`` along x.
+The cell has the lattice vectors (side, 0) and (tilt · side, side).
 """
 
 import math

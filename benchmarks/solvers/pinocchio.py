@@ -10,7 +10,7 @@ Dense matrices are copied to the stack, which has to be larger than usual for mo
 contacts. There is no limit of time, so that of iterations is set by their measured time.
 
 Source of the second method: Carpentier, Le Lidec and Montaut, From Compliant to Rigid Contact
-  Simulation: a Unified and Efficient Approach, Robotics: Science and Systems (2024).
+Simulation: a Unified and Efficient Approach, Robotics: Science and Systems (2024).
 """
 
 import resource

@@ -1,8 +1,8 @@
 """Pages whose examples run when the site is built, each block followed by its output.
 
 The blocks of a page run in order, in a folder of their own: Python in one namespace, and commands
-  of ``jaxgran`` in the shell. What a block prints is shown below it, and the Matplotlib figure that
-  is the value of its last line.
+of ``jaxgran`` in the shell. What a block prints is shown below it, and the Matplotlib figure that
+is the value of its last line.
 """
 
 import ast

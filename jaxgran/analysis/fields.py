@@ -14,7 +14,7 @@ the step that begins with it, over which the densities change by dt times the ri
 exactly for contacts, to first order in dt for flight.
 
 Sources: Lois, Lemaître and Carlson for ρ, ρV and Σ (their energy equation has the opposite signs on
-  the right); Goldhirsch and Goldenberg, Eur. Phys. J. E 9, 245 (2002), for the line integral.
+the right); Goldhirsch and Goldenberg, Eur. Phys. J. E 9, 245 (2002), for the line integral.
 """
 
 from dataclasses import dataclass

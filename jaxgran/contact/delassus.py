@@ -2,7 +2,7 @@
 iteration by.
 
 W of a network is never stored: Hᵀ gathers the impulses of the contacts on their grains, H reads the
-  relative normal velocities that follow. Two diagonals D stand for it in the ``projected_methods``:
+relative normal velocities that follow. Two diagonals D stand for it in the ``projected_methods``:
 
 - ``diagonal``: W_cc = 1/m_i + 1/m_j. The classical choice; nothing bounds W by it, and networks
   make it diverge.

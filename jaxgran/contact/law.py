@@ -6,8 +6,8 @@ with arrays of JAX; the numba engine compiles the same source for numbers
 solver, is written for each engine, and tests compare them.
 
 The rule: a pair is a contact when free flight over the look-ahead time θ·dt makes it overlap. With
-  s the separation, u the relative velocity in the laboratory and d the sum of the radii, the gap
-  along the flight is f(t) = |s + u t|² − d² = |u|² t² + 2 s·u t + |s|² − d².
+s the separation, u the relative velocity in the laboratory and d the sum of the radii, the gap
+along the flight is f(t) = |s + u t|² − d² = |u|² t² + 2 s·u t + |s|² − d².
 """
 
 from typing import Any

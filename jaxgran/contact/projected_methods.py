@@ -18,16 +18,16 @@ Where W ⪯ D, a Jacobi step lowers ½pᵀWp + bᵀp for every ω < 2, and Neste
 = 1. With diag(W) neither holds (``benchmarks/stability.py``).
 
 Barzilai and Borwein take τ from the last step s: sᵀDs/sᵀWs and sᵀWs/(Ws)ᵀD⁻¹(Ws) in turn, both at
-  least 1 as W ⪯ D. The objective does not fall in every step, and with a projection the iterates
-  can cycle. The safeguard needs no values of the objective: where the best residual has not halved
-  over 100 steps, the method continues as Nesterov's. So either the residual falls at that rate, or
-  the iteration is one that converges. This is the default: in flows it needs a fifth to a third
-  fewer products than Nesterov's method alone (``benchmarks solvers``).
+least 1 as W ⪯ D. The objective does not fall in every step, and with a projection the iterates can
+cycle. The safeguard needs no values of the objective: where the best residual has not halved over
+100 steps, the method continues as Nesterov's. So either the residual falls at that rate, or the
+iteration is one that converges. This is the default: in flows it needs a fifth to a third fewer
+products than Nesterov's method alone (``benchmarks solvers``).
 
 A subclass of ``ProjectedMethod`` is a method too, wherever it is written.
 
 Sources: Nesterov (1983); O'Donoghue and Candès (2015) for the restart; Barzilai and Borwein (1988);
-  Birgin, Martínez and Raydan (2000) for projected spectral gradients.
+Birgin, Martínez and Raydan (2000) for projected spectral gradients.
 """
 
 import json

@@ -2,9 +2,9 @@
 follow.
 
 The fields of ``Tally`` are the table: every row has a shape, a unit, a meaning, and what adds to
-  it. While the time loop runs, an engine keeps the sums as plain numbers. Their order follows from
-  the table (``LAYOUT``), so no position is written down anywhere. A new sum over contacts is one
-  row here and one term of ``contact.law.contact_terms``.
+it. While the time loop runs, an engine keeps the sums as plain numbers. Their order follows from
+the table (``LAYOUT``), so no position is written down anywhere. A new sum over contacts is one row
+here and one term of ``contact.law.contact_terms``.
 """
 
 from dataclasses import dataclass, field, fields, replace

@@ -2,11 +2,11 @@
 and its error bars.
 
 It is the strain of one independent sample: 2s for a correlation that decays exponentially over a
-  strain s. Two processes are slow. The granular temperature follows the heating by the shear over a
-  strain of nT/τ, thermal energy over shear stress. Waves of velocity and density as long as the
-  cell decay over a strain that grows as its side L, about 0.35 γ̇ L √(ρ/p): the time that a sound
-  wave needs for a third of the cell. ``python -m benchmarks size_study`` compares this law with the
-  correlation of measured series.
+strain s. Two processes are slow. The granular temperature follows the heating by the shear over a
+strain of nT/τ, thermal energy over shear stress. Waves of velocity and density as long as the cell
+decay over a strain that grows as its side L, about 0.35 γ̇ L √(ρ/p): the time that a sound wave
+needs for a third of the cell. ``python -m benchmarks size_study`` compares this law with the
+correlation of measured series.
 """
 
 from collections.abc import Mapping

@@ -10,9 +10,9 @@ In one step dt a grain of thermal speed moves by x = dt √T/σ. The errors foll
   midpoint rule the error is far smaller for grains that bounce.
 
 Kinetic theory underestimates the temperature of dense flows: close to jamming the geometry drives
-  the grains, for any restitution. The numbers here are bounds on what ``python -m benchmarks
-  stability`` and ``python -m benchmarks speed_vs_accuracy`` find for this size distribution. They
-  serve to choose a time step and are not results.
+the grains, for any restitution. The numbers here are bounds on what ``python -m benchmarks
+stability`` and ``python -m benchmarks speed_vs_accuracy`` find for this size distribution. They
+serve to choose a time step and are not results.
 """
 
 import numpy as np

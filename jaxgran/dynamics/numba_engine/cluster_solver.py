@@ -5,8 +5,8 @@ chains, grains of very different mass, flows about to jam) the guarded method of
 Borwein continues from their result.
 
 Source: the sweeps are those of C. W. Cryer, SIAM J. Control 9, 385 (1971), and converge for
-  semidefinite W by O. L. Mangasarian, J. Optim. Theory Appl. 22, 465 (1977). The other method:
-  ``contact.projected_methods``.
+semidefinite W by O. L. Mangasarian, J. Optim. Theory Appl. 22, 465 (1977). The other method:
+``contact.projected_methods``.
 """
 
 import math

@@ -2,10 +2,10 @@
 impulses.
 
 A record is a row of numbers: its step, whether contacts act in it, how many there are, and the
-  tilt; then x, y, c_x and c_y of every grain before the contacts act; then i, j, n_x, n_y, u,
-  distance and impulse of every contact. Positions are not wrapped. A list of near pairs, and a call
-  that continues with one, begin with a record without contacts. So every flight is recorded within
-  the life of a list.
+tilt; then x, y, c_x and c_y of every grain before the contacts act; then i, j, n_x, n_y, u,
+distance and impulse of every contact. Positions are not wrapped. A list of near pairs, and a call
+that continues with one, begin with a record without contacts. So every flight is recorded within
+the life of a list.
 """
 
 import math
