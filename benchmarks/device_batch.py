@@ -21,10 +21,10 @@ import jaxgran as jg
 from benchmarks.independent import contact_dynamics
 from benchmarks.output import Output
 from benchmarks.step_cost import rival_arguments
-from jaxgran.dynamics.engine import DEFAULT_NUMERICS, in_lockstep, select_engine
+from jaxgran.dynamics.engine import DEFAULT_NUMERICS, select_engine
 from jaxgran.environment import usable_cores
 from jaxgran.maps.presets import PRESETS
-from jaxgran.sampling.batch import advance_batch, for_replicas, replicated
+from jaxgran.sampling.observe import advance_batch
 
 POINTS, TIMESTEPS = ((0.9, 0.56), (0.5, 0.7), (0.5, 0.8)), (1e-3, 1e-4)
 REPLICAS, GRAINS, STRAIN = 1000, 256, 0.2
@@ -80,7 +80,7 @@ def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
         lambda *x: jnp.stack([x[n % DISTINCT] for n in range(replicas)]), *distinct
     )
     flows = jax.tree.map(lambda x: jnp.full(replicas, x), flow)
-    steps, numerics = round(STRAIN / dt), for_replicas(DEFAULT_NUMERICS, replicas)
+    steps, numerics = round(STRAIN / dt), DEFAULT_NUMERICS
     few = steps // PLAIN_SHARE
     ways = {  # what is done in a call, and how many replica-steps that is
         "taken": (
@@ -115,7 +115,7 @@ def _plain_replica(
     return jg.advance(flow, state, steps, engine=jg.Jax())
 
 
-plain = jax.jit(lambda *arguments: replicated(_plain_replica, in_lockstep())(*arguments))
+plain = jax.jit(jax.vmap(_plain_replica))
 
 
 def rivals(flow: jg.ShearFlow, states: list[jg.State], steps: int) -> None:

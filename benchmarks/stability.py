@@ -29,12 +29,12 @@ from matplotlib.patches import Patch, Rectangle
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.contact.delassus import diagonal
+from jaxgran.dynamics.batch import stack
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import DEEP_OVERLAP
 from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TWO_COLUMNS, scientific, styled
 from jaxgran.sampling.averages import averages
-from jaxgran.sampling.batch import stack
 from jaxgran.sampling.prediction import predicted
 
 RESTITUTIONS = (0.0, 0.5, 0.9)

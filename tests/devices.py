@@ -25,7 +25,7 @@ from jaxgran.dynamics.engine import Numerics  # noqa: E402
 from jaxgran.model.flow import ShearFlow  # noqa: E402
 from jaxgran.model.grains import Grains  # noqa: E402
 from jaxgran.model.state import State  # noqa: E402
-from jaxgran.sampling.batch import advance_batch  # noqa: E402
+from jaxgran.sampling.observe import advance_batch  # noqa: E402
 
 like = (ShearFlow(int(grains), 0.5, 0.6, 1e-3), Numerics(), State(Grains(0, 0), 0, 0, 0, 0), 0)
 with np.load(start) as arrays:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jaxgran.dynamics.batch import stack
 from jaxgran.model.flow import ShearFlow
-from jaxgran.sampling.batch import stack
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.timestep import (
     automatic_timestep,

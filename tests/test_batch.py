@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 from flows import GRAINS
 
+from jaxgran.dynamics.batch import stack
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.tally import TABLE
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains, own_grains
 from jaxgran.model.state import State
-from jaxgran.sampling.batch import advance_batch, for_replicas, stack
+from jaxgran.sampling.observe import advance_batch
 
 PROGRAM = Path(__file__).with_name("devices.py")
 RESTITUTIONS = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9)  # more than four devices, and not a multiple
@@ -51,7 +52,7 @@ def batch(tmp_path: Path) -> Path:
     state = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
     flow = stack([ShearFlow(GRAINS, alpha, 0.6, 1e-3) for alpha in RESTITUTIONS])
     assert jax.device_count() == 1
-    numerics = for_replicas(Numerics(), len(STEPS))
+    numerics = Numerics()
     _save(tmp_path / "start.npz", (flow, numerics, state, np.asarray(STEPS, np.int32)))
     end, tally = advance_batch(flow, numerics, state, jnp.asarray(STEPS, jnp.int32))
     assert np.all(np.asarray(tally.collisions)[np.asarray(STEPS) > 0] > 0)

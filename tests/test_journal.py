@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from synthetic import random_tally
 
+from jaxgran.dynamics.batch import stack
 from jaxgran.io.atomic import CorruptFile
 from jaxgran.maps import journal as journal_module
 from jaxgran.maps.journal import Journal
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
-from jaxgran.sampling.batch import advance_batch, stack
+from jaxgran.sampling.observe import advance_batch
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 
 KEYS = [(0, 0), (1, 0)]

@@ -14,13 +14,14 @@ from flows import OF_INSTANTS, replica
 from synthetic import one_sentence, random_tally, refused
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
+from jaxgran.dynamics.batch import stack
 from jaxgran.dynamics.tally import EXTREMES, TABLE
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State, require_match
 from jaxgran.model.status import DEEP_SHARE, Status
-from jaxgran.sampling.batch import advance_batch, stack
 from jaxgran.sampling.observables import OBSERVABLES
+from jaxgran.sampling.observe import advance_batch
 from jaxgran.sampling.sample import BLOCKS, Sample, _sample, check_precision, sample
 from jaxgran.sampling.steady_state import Batch, prepare_batch
 

@@ -14,12 +14,13 @@ import pytest
 from flows import assert_same_bits, replica
 from synthetic import one_sentence
 
+from jaxgran.dynamics.batch import run_batch, stack
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 from jaxgran.sampling import steady_state, timestep
-from jaxgran.sampling.batch import advance_batch, reporting, stack
+from jaxgran.sampling.observe import advance_batch, reporting
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.sample import relative_error
 from jaxgran.sampling.steady_state import Batch, prepare, prepare_batch, sample_batch
@@ -53,7 +54,7 @@ def test_same_key_gives_the_same_state_and_another_key_another(batch, keys) -> N
 
 def test_start_has_the_temperature_asked_for_and_no_momentum(keys) -> None:
     temperature = jnp.asarray([0.3, 2.0])
-    state, found = steady_state._heated(stack(FLOWS), keys, temperature, None, lockstep=False)
+    state, found = run_batch(steady_state._heated, (stack(FLOWS), keys, temperature, None))
     masses, velocities = np.asarray(state.grains.masses), np.asarray(state.velocities)
     assert np.all(found)
     np.testing.assert_allclose(np.sum(masses[..., None] * velocities, axis=1), 0, atol=1e-12)
@@ -257,10 +258,16 @@ def test_nan_in_one_replica_ends_as_nonfinite_and_leaves_the_others_bit_identica
     assert_same_bits(replica(broken_measured, 0), replica(measured, 0))
 
 
+def only(batch: Batch, k: int) -> Batch:
+    """A batch of one replica of another."""
+    numerics, replicas = batch.numerics, batch._replace(numerics=None)
+    return jax.tree.map(lambda x: x[k : k + 1], replicas)._replace(numerics=numerics)
+
+
 def test_a_replica_that_is_given_up_is_not_advanced_and_changes_no_other(batch) -> None:
     jammed = batch._replace(status=np.array([Status.ok, Status.infeasible]))
     end, measured = sample_batch(jammed, strain=0.64, error=1e-9)
-    _, alone = sample_batch(jax.tree.map(lambda x: x[:1], batch), strain=0.64, error=1e-9)
+    _, alone = sample_batch(only(batch, 0), strain=0.64, error=1e-9)
     assert_same_bits(replica(measured, 0), replica(alone, 0))
     assert end.status[1] == Status.infeasible and not np.any(measured.tally.steps[1])
     assert_same_bits(replica(end.state, 1), replica(batch.state, 1))
@@ -284,9 +291,7 @@ def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(
         assert reached or end.status[k] >= Status.strain_limit
         assert np.isclose(strains[k], 0.64) == (errors[k] <= target)
         assert reached or np.isclose(strains[k], 2.56)
-        _, alone = sample_batch(
-            jax.tree.map(lambda x, k=k: x[k : k + 1], batch), 0.64, error=float(target)
-        )
+        _, alone = sample_batch(only(batch, k), 0.64, error=float(target))
         assert_same_bits(replica(alone, 0), replica(grown, k))
 
 

@@ -19,8 +19,8 @@ from test_docs import python_of
 
 import jaxgran as jg
 from jaxgran.dynamics import engine
+from jaxgran.dynamics.batch import over_replicas
 from jaxgran.dynamics.engine import Numerics
-from jaxgran.dynamics.replicas import over_replicas
 from jaxgran.model.control_flow import in_batch
 from jaxgran.model.state import State
 from jaxgran.sampling import sample as sample_module
@@ -56,12 +56,14 @@ def test_numbers_that_are_the_same_for_all_replicas_are_broadcast() -> None:
 
 
 def test_batch_is_sampled_as_under_vmap_and_as_one_by_one(states: State) -> None:
-    """To the bit, but for the energy of waves: vectors of cosines are rounded by their length."""
+    """To the bit, but for the energy of waves under ``vmap``: vectors of cosines are rounded by
+    their length.
+    """
     together = sample(FLOWS, states, 0.3)
-    assert_same(together, jax.vmap(sample, (0, 0, None))(FLOWS, states, 0.3))
+    vmapped = jax.vmap(sample, (0, 0, None))(FLOWS, states, 0.3)
+    assert_same(together, vmapped, but="wave_kinetic")
     for k in range(3):
-        alone = sample(FLOWS[k], states[k], 0.3)
-        assert_same(jax.tree.map(lambda x, k=k: x[k], together), alone, but="wave_kinetic")
+        assert_same(jax.tree.map(lambda x, k=k: x[k], together), sample(FLOWS[k], states[k], 0.3))
 
 
 def test_what_lacks_the_axis_is_the_same_for_all_replicas(states: State) -> None:
@@ -100,13 +102,13 @@ def test_replicas_advance_together_on_an_accelerator_only(
     np.testing.assert_array_equal(found, ALPHAS * float(platform == "accelerator"))
 
 
-def test_more_replicas_up_to_a_power_of_two_compile_nothing(states: State, monkeypatch) -> None:
+def test_batches_of_any_size_are_compiled_once(states: State, monkeypatch) -> None:
     traced = []
     original = sample_module._sample_blocks
     monkeypatch.setattr(
         sample_module, "_sample_blocks", lambda *x: (traced.append(x), original(*x))[1]
     )
-    for count in (5, 6, 8, 7):
+    for count in (5, 1, 8):
         many = np.arange(count) % 3
         _, found = jg.sample(FLOWS[many], states[many], 0.1, blocks=3)
         assert found.tally.steps.shape == (count, 3)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxgran.dynamics.threads import Cancelled, in_threads
+from jaxgran.dynamics.batch import Cancelled, in_threads
 from jaxgran.maps.replica import Advance
 from jaxgran.maps.run_replicas import run_replicas
 from jaxgran.maps.settings import MapSettings

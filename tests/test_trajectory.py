@@ -20,6 +20,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from synthetic import refused
 
+from jaxgran.dynamics.batch import stack
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.io import trajectory
@@ -32,7 +33,6 @@ from jaxgran.io.trajectory import (
 from jaxgran.model.cell import displacement
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
-from jaxgran.sampling.batch import for_replicas, stack
 from jaxgran.sampling.recorder import Recorder
 
 TILTS = (-0.4, 0.0, 0.3)
@@ -81,7 +81,7 @@ def recorded(flow, flowing, drive, tmp_path_factory):
 
 def driven_in_blocks(drive, flow, state, blocks):
     flows, states, tallies = stack([flow]), jax.tree.map(lambda x: x[None], state), []
-    numerics = for_replicas(Numerics(EXACT), 1)
+    numerics = Numerics(EXACT)
     for steps in blocks:
         states, tally = drive(flows, numerics, states, jnp.asarray([steps], jnp.int32))
         tallies.append(tally)

@@ -20,8 +20,8 @@ from jaxtyping import Array, Float
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.batch import checked_batch
 from jaxgran.dynamics.jax_engine import count_events, require_advance
-from jaxgran.dynamics.replicas import checked_batch
 from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import displacement
 from jaxgran.model.checks import InputError, require_number, require_untraced, require_whole

@@ -15,10 +15,10 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
+from jaxgran.dynamics.batch import checked_batch, over_replicas
 from jaxgran.dynamics.batching import with_forward_derivative, with_own_batching
 from jaxgran.dynamics.engine import Engine, Numba, Numerics, checked_numerics, select_engine
 from jaxgran.dynamics.jax_engine import advance_by_jax, ended, require_advance
-from jaxgran.dynamics.replicas import checked_batch, over_replicas
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
 from jaxgran.model.control_flow import in_batch
 from jaxgran.model.flow import ShearFlow

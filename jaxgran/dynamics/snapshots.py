@@ -22,8 +22,8 @@ from jaxgran.contact.network import MOST_CONTACTS, Contacts, Touching, is_contac
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.batch import checked_batch, shear_batch
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
-from jaxgran.dynamics.replicas import checked_batch, compiled_over_replicas
 from jaxgran.dynamics.step import closing_speed_bound
 from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.cell import remap_tilt, wrap
@@ -150,8 +150,8 @@ def snapshot_series(
     strain = as_array(strain)
     require("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
     if batch := checked_batch(partial(_require_series, count), flow, state, strain):
-        return compiled_over_replicas(_snapshot_series, (count,), "", numerics, *batch)
-    return _snapshot_series(flow, numerics, state, strain, count)
+        return shear_batch(_snapshot_series, numerics, batch, (count,))
+    return _snapshot_series(flow, state, strain, numerics, count)
 
 
 def _require_series(count: int, flow: ShearFlow, state: State, strain: Any) -> None:
@@ -162,7 +162,7 @@ def _require_series(count: int, flow: ShearFlow, state: State, strain: Any) -> N
 
 @partial(jax.jit, static_argnames="count")
 def _snapshot_series(
-    flow: ShearFlow, numerics: Numerics, state: State, strain: Array, count: int
+    flow: ShearFlow, state: State, strain: Array, numerics: Numerics, count: int
 ) -> tuple[State, Snapshot]:
     return lax.scan(
         partial(_later, flow, numerics),

@@ -3,12 +3,12 @@
 So no core is idle for long at the end. The numbers of a replica do not depend on its batch.
 """
 
-import math
 from collections.abc import Container
 from heapq import heappop, heappush
 
 import jax
 
+from jaxgran.dynamics.batch import predicted_cost
 from jaxgran.dynamics.engine import in_lockstep
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.replica import Key
@@ -18,26 +18,12 @@ from jaxgran.sampling.correlation_strain import LEAST_SAMPLE, RELAXATION_STRAIN
 from jaxgran.sampling.steady_state import LEAST_PREPARATION
 from jaxgran.sampling.timestep import COARSE_TIMESTEP
 
-_LARGEST_CPU_BATCH = 4  # replicas of one core between two reports
 _PAIR_BYTES = 48  # of memory for each pair of grains, in a search that compares all pairs
 # of memory for each grain: lists, network and state; grains are rounded up to a power of two
 _GRAIN_BYTES = 2500
 _SHARE_OF_MEMORY = 0.5  # of a device, for one batch
 _DEFAULT_MEMORY = 8 * 2**30  # bytes of a device that does not report its memory
 _LARGEST_COST_RATIO = 2  # between replicas that advance in lockstep
-
-
-def predicted_cost(flow: ShearFlow, timestep: float | None = None) -> float:
-    """Relative cost of a unit of strain of a flow, at its own or another time step: a fit to
-    measured times.
-
-    The cost is proportional to the number of grains. Dense and dissipative flows form contact
-    networks; the second factor is their cost at dt = 1e-3. Steps without a contact are jumped over,
-    so ten times as many steps cost little more than twice as much.
-    """
-    dt = float(flow.timestep if timestep is None else timestep)
-    alpha, nu = float(flow.restitution), float(flow.packing_fraction)
-    return flow.grains * (8 + 600 * (1 - alpha) * math.exp((nu - 0.8) / 0.04)) * (1e-3 / dt) ** 0.35
 
 
 def replica_cost(flow: ShearFlow, equilibrate: float | None, strain: float | None) -> float:
@@ -69,18 +55,16 @@ def points_of_part(settings: MapSettings) -> list[int]:
     return sorted(shares[number - 1])
 
 
-def remaining_batches(
-    settings: MapSettings, workers: int, checkpoint: Checkpoint | None
-) -> list[list[Key]]:
+def remaining_batches(settings: MapSettings, checkpoint: Checkpoint | None) -> list[list[Key]]:
     """The batches that a checkpoint does not have yet, the interrupted ones first."""
     if checkpoint is None:
-        return batches(settings, workers)
+        return batches(settings)
     interrupted = checkpoint.journals()
     excluded = {*checkpoint.done, *(key for task in interrupted for key in task)}
-    return interrupted + batches(settings, workers, excluded)
+    return interrupted + batches(settings, excluded)
 
 
-def batches(settings: MapSettings, workers: int, without: Container[Key] = ()) -> list[list[Key]]:
+def batches(settings: MapSettings, without: Container[Key] = ()) -> list[list[Key]]:
     """The replicas in batches of one number of grains and of similar cost, the most expensive
     first.
     """
@@ -97,7 +81,7 @@ def batches(settings: MapSettings, workers: int, without: Container[Key] = ()) -
             for seed in range(settings.seeds)
             if (point, seed) not in without
         ]
-        most = batch_size(grains, len(keys), workers) if keys else 0
+        most = batch_size(grains, len(keys)) if keys else 0
         alike: list[list[Key]] = []
         for key in keys:
             full = not alike or len(alike[-1]) == most
@@ -108,17 +92,13 @@ def batches(settings: MapSettings, workers: int, without: Container[Key] = ()) -
     return sorted(tasks, key=lambda task: -costs[task[0][0]])
 
 
-def batch_size(grains: int, count: int, workers: int) -> int:
-    """Replicas of a batch: a few on a CPU, as many as fit into half the memory on an
-    accelerator.
+def batch_size(grains: int, count: int) -> int:
+    """Replicas of a batch: one for each device of a processor, as many as fit into half the memory
+    of an accelerator.
     """
     devices, device = jax.device_count(), jax.local_devices()[0]
     if device.platform == "cpu":
-        largest = max(
-            min(devices, count), min(_LARGEST_CPU_BATCH * devices, count // (8 * workers))
-        )
-        # equal batches: a smaller last one would compile again
-        return next(size for size in range(largest, 0, -1) if count % size == 0)
+        return min(devices, count)
     memory = (device.memory_stats() or {}).get("bytes_limit", _DEFAULT_MEMORY)
     per_replica = (
         _GRAIN_BYTES * max(64, 1 << (grains - 1).bit_length()) + _PAIR_BYTES * min(grains, 512) ** 2

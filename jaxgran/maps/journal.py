@@ -21,8 +21,7 @@ from jaxgran.dynamics.tally import Tally, flat_tally, tally_from_flat
 from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
-from jaxgran.sampling.batch import ObserveBatch
-from jaxgran.sampling.observe import Observable, observed_shapes
+from jaxgran.sampling.observe import Observable, ObserveBatch, observed_shapes
 
 SECONDS = 5.0  # shortest time between two writes of a journal
 WRITING_SHARE = 0.05  # largest share of the time that is spent on writing

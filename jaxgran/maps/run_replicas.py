@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, UInt32
 
 from jaxgran.cache.persistent_jit import persistent_jit
-from jaxgran.dynamics.threads import in_threads
+from jaxgran.dynamics.batch import in_threads, replicas_of, stack
 from jaxgran.io.atomic import CorruptFile
 from jaxgran.maps.batches import remaining_batches
 from jaxgran.maps.checkpoint import Checkpoint
@@ -24,8 +24,8 @@ from jaxgran.maps.cluster import Provenance, run_on_cluster
 from jaxgran.maps.journal import Journal
 from jaxgran.maps.replica import Advance, Key, Replica
 from jaxgran.maps.settings import MapSettings
-from jaxgran.sampling.batch import AdvanceWrapper, ObserveBatch, advance_batch, reporting, stack
 from jaxgran.sampling.budget import sampling_error
+from jaxgran.sampling.observe import AdvanceWrapper, ObserveBatch, advance_batch, reporting
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 
 
@@ -54,7 +54,7 @@ def run_replicas(
         It has an effect only with one worker, and each of its batches is one replica.
       made: receives what the workers of a cluster computed with.
     """
-    tasks, flows = remaining_batches(settings, workers, checkpoint), settings.flows()
+    tasks, flows = remaining_batches(settings, checkpoint), settings.flows()
     if record is not None:  # a recorder follows one replica
         tasks = [[key] for task in tasks for key in task]
     calls = [
@@ -153,9 +153,7 @@ def _measured(
     """Prepare and sample the replicas of a batch."""
     flows = settings.flows()
     flow = stack([flows[point] for point, _ in task])
-    keys = jax.device_put(
-        np.stack([_key(settings.first_seed + seed, point) for point, seed in task])
-    )
+    keys = np.stack([_key(settings.first_seed + seed, point) for point, seed in task])
     grains = settings.grains_of(flow.grains, len(task))
     batch = prepare_batch(
         flow, keys, settings.equilibrate, advance, grains=grains, numerics=settings.numerics
@@ -170,12 +168,6 @@ def _measured(
     batch, sample = sample_batch(
         batch, settings.strain, sampling if record is None else record(sampling), error
     )
-    states = [None] * len(task)
-    if settings.snapshots:
-        whole = jax.tree.map(np.asarray, batch.state)
-        states = [jax.tree.map(lambda x, k=k: x[k], whole) for k in range(len(task))]
-    numbers = zip(batch.status.tolist(), strain_before.tolist(), states, strict=True)
-    return [
-        (key, Replica(jax.tree.map(lambda x, k=k: x[k], sample), *one))
-        for k, (key, one) in enumerate(zip(task, numbers, strict=True))
-    ]
+    states = replicas_of(batch.state) if settings.snapshots else [None] * len(task)
+    columns = replicas_of(sample), batch.status.tolist(), strain_before.tolist(), states
+    return [(key, Replica(*values)) for key, *values in zip(task, *columns, strict=True)]

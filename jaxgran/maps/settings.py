@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, require_solver
+from jaxgran.dynamics.batch import stack
 from jaxgran.dynamics.engine import Numerics, checked_numerics, select_engine
 from jaxgran.maps.own_observables import require_observe
 from jaxgran.maps.parameters import MapParameters, default
@@ -27,7 +28,6 @@ from jaxgran.model.checks import (
 from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains, own_grains
-from jaxgran.sampling.batch import stack
 from jaxgran.sampling.budget import SHARES, fewest_grains, size_error
 from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
 from jaxgran.sampling.packing import require_room

@@ -8,16 +8,19 @@ import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.contact.network import MOST_CONTACTS, Contacts
-from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.advance import advance, register_numba
+from jaxgran.dynamics.batch import predicted_cost, run_batch
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.observed_advance import advance_observed
 from jaxgran.dynamics.observer import nothing_observed, without_contacts
@@ -31,6 +34,84 @@ from jaxgran.model.status import Status
 
 _NEEDS_VALUES = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
 Observable = Callable[[Snapshot], Any]  # returns a pytree of arrays to average
+
+# Advances each replica of a batch by its number of steps, (replicas,), and a wrapper that adds
+# reports or records and leaves the states alone.
+AdvanceBatch = Callable[[ShearFlow, Numerics, State, Array], tuple[State, Tally]]
+AdvanceWrapper = Callable[[AdvanceBatch], AdvanceBatch]
+# Called with time step and number of steps of each replica.
+Report = Callable[[ArrayLike, ArrayLike], None]
+
+
+class ObserveBatch(Protocol):
+    """An ``AdvanceBatch`` that can observe the replicas while it advances them."""
+
+    def __call__(
+        self,
+        flow: ShearFlow,
+        numerics: Numerics,
+        state: State,
+        steps: Array,
+        observe: Observable | None = None,
+    ) -> tuple[State, Tally]: ...
+
+
+def advance_batch(
+    flow: ShearFlow,
+    numerics: Numerics,
+    state: State,
+    steps: Array,
+    observe: Observable | None = None,
+    threads: int = 1,
+) -> tuple[State, Tally]:
+    """Advance each replica of a batch by its number of time steps.
+
+    Args:
+      flow, state, steps: with a leading (replicas,) axis.
+      numerics: the same for all replicas.
+      observe: a function of a ``Snapshot``, see ``sample``; its sums are in ``Tally.observed``.
+      threads: most threads on a processor, see ``run_batch``.
+
+    Raises:
+      InputError: the engine cannot do this.
+    """
+    strain = np.asarray(steps) * np.asarray(flow.timestep)
+    costs = predicted_cost(flow) * strain if threads > 1 else None
+    run = partial(run_batch, batch=(flow, state, steps), costs=costs, threads=threads)
+    if observe is None:
+        return run(_advance_replica, shared=(numerics,))
+    return run(_observe_replica, shared=(numerics,), static=(observe,))
+
+
+def _advance(
+    flow: ShearFlow,
+    state: State,
+    steps: Array,
+    numerics: Numerics,
+    observe: Observable | None = None,
+) -> tuple[State, Tally]:
+    return advance_and_observe(flow, numerics, state, steps, observe)
+
+
+_advance_replica = persistent_jit(_advance, register_numba)
+_observe_replica = jax.jit(_advance, static_argnames="observe")
+
+
+def reporting(advance: ObserveBatch, report: Report) -> ObserveBatch:
+    """The same advance with a report after each call."""
+
+    def advance_and_report(
+        flow: ShearFlow,
+        numerics: Numerics,
+        state: State,
+        steps: Array,
+        observe: Observable | None = None,
+    ) -> tuple[State, Tally]:
+        state, tally = advance(flow, numerics, state, steps, observe)
+        report(flow.timestep, tally.steps)
+        return state, tally
+
+    return advance_and_report
 
 
 def advance_and_observe(

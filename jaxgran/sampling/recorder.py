@@ -17,7 +17,7 @@ from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow, steps_of_strain
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
-from jaxgran.sampling.batch import AdvanceBatch
+from jaxgran.sampling.observe import AdvanceBatch
 
 Keep = Callable[
     [Snapshot, int], None
@@ -77,7 +77,7 @@ class Recorder:
     def _record(self, flow: ShearFlow, numerics: Numerics, state: State) -> None:
         if not np.isfinite(np.asarray(state.velocities)).all():  # the status reports it
             return
-        flow, numerics, state = jax.tree.map(lambda x: x[0], (flow, numerics, state))
+        flow, state = jax.tree.map(lambda x: x[0], (flow, state))
         frame = snapshots_from(flow, numerics, state, self.force_strain)
         for keep in self.keep:
             keep(frame, self.steps)

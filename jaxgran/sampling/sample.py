@@ -15,9 +15,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.advance import advance_blocks
+from jaxgran.dynamics.batch import checked_batch, shear_batch
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.interruption import waited
-from jaxgran.dynamics.replicas import checked_batch, compiled_for_few_sizes, compiled_over_replicas
 from jaxgran.dynamics.tally import TABLE, Tally
 from jaxgran.model.batches import Indexable, equal_values, in_numpy
 from jaxgran.model.checks import (
@@ -383,10 +383,9 @@ def sample(
             raise InputError(f"{name} must be a function or None, not {short_repr(function)}.")
     if callback is None:
         if batch is None:
-            return waited(_sample(flow, numerics, state, strain, blocks, observe))
+            return waited(_sample(flow, state, strain, numerics, blocks, observe))
         option = "" if observe is None else "observe"
-        program = partial(compiled_over_replicas, _sample, (blocks, observe), option, numerics)
-        return compiled_for_few_sizes(program, numerics, batch)
+        return shear_batch(_sample, numerics, batch, (blocks, observe), option)
     if batch or is_traced(flow, numerics, state, strain):
         raise InputError(
             "callback must be None for a batch, and where a sample is transformed, as by jax.jit."
@@ -407,9 +406,9 @@ def _require_sheared_state(blocks: int, flow: ShearFlow, state: State, strain: A
 @partial(jax.jit, static_argnames=("blocks", "observe"))
 def _sample(
     flow: ShearFlow,
-    numerics: Numerics,
     state: State,
     strain: Array,
+    numerics: Numerics,
     blocks: int,
     observe: Observable | None = None,
 ) -> tuple[State, Sample]:

@@ -31,15 +31,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
-from jaxgran.dynamics.engine import (
-    DEFAULT_NUMERICS,
-    Engine,
-    Numerics,
-    checked_numerics,
-    in_lockstep,
-)
+from jaxgran.dynamics.batch import run_batch, stack
+from jaxgran.dynamics.engine import DEFAULT_NUMERICS, Engine, Numerics, checked_numerics
 from jaxgran.dynamics.tally import Tally
+from jaxgran.environment import usable_threads
 from jaxgran.model.checks import (
     InputError,
     is_traced,
@@ -53,14 +50,6 @@ from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import GIVEN_UP, Status
 from jaxgran.sampling.averages import averages
-from jaxgran.sampling.batch import (
-    AdvanceBatch,
-    advance_batch,
-    advance_on_all_cores,
-    batch_program,
-    for_replicas,
-    stack,
-)
 from jaxgran.sampling.correlation_strain import (
     LEAST_SAMPLE,
     RELAXATION_STRAIN,
@@ -68,6 +57,7 @@ from jaxgran.sampling.correlation_strain import (
     flow_correlation_strain,
     length_status,
 )
+from jaxgran.sampling.observe import AdvanceBatch, advance_batch
 from jaxgran.sampling.packing import pack, require_room
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.sample import BLOCKS, Sample, check_precision, relative_error
@@ -101,7 +91,9 @@ _UNCOMPILED = (
 
 
 class Batch(NamedTuple):
-    """Replicas in preparation; all arrays have a leading (replicas,) axis."""
+    """Replicas in preparation; all arrays but those of ``numerics`` have a leading (replicas,)
+    axis.
+    """
 
     flow: ShearFlow
     numerics: Numerics
@@ -159,9 +151,8 @@ def prepare(
         require_number("equilibrate", equilibrate, lambda x: (x >= 0) & (x <= 1e6), words)
     require_sheared(flow)
     numerics = checked_numerics(solver, engine)
-    batch = prepare_batch(
-        flows, keys, equilibrate, advance_on_all_cores, grains=discs, numerics=numerics
-    )
+    on_all_cores = partial(advance_batch, threads=usable_threads())
+    batch = prepare_batch(flows, keys, equilibrate, on_all_cores, grains=discs, numerics=numerics)
     tolerated = Status.ok if equilibrate is None else Status.not_steady
     if single and batch.status[0] > tolerated:
         raise RuntimeError(f"the flow could not be prepared: {Status(batch.status[0]).name}.")
@@ -193,15 +184,14 @@ def prepare_batch(
         theory.granular_temperature, flow.packing_fraction, flow.shear_rate
     )
     temperature = expected.astype(theory.granular_temperature.dtype)
-    state, packed = _heated(flow, keys, temperature, grains, lockstep=in_lockstep())
+    state, packed = run_batch(_heated, (flow, keys, temperature, grains))
     check_precision(flow, state)
     status = np.where(np.asarray(packed), Status.ok, Status.infeasible)
     coarse = replace(flow, timestep=bounded_coarse_timestep(flow, theory, grains))
     predictions = {
         name: getattr(theory, name) for name in ("granular_temperature", "pressure", "shear_stress")
     }
-    each = for_replicas(numerics, len(status))
-    batch = Batch(coarse, each, state, status, np.zeros(len(status)), np.zeros(len(status)))
+    batch = Batch(coarse, numerics, state, status, np.zeros(len(status)), np.zeros(len(status)))
     batch = batch._replace(correlation_strain=_correlation_strain(batch, predictions))
     if equilibrate is None:
         batch = _until_steady(batch, advance)
@@ -292,7 +282,7 @@ def heated(
 
     require("temperature", temperature, accepted, "a positive number")
     temperatures = jnp.broadcast_to(jnp.asarray(temperature, float), len(keys))
-    state, found = _heated(flows, keys, temperatures, discs, lockstep=in_lockstep())
+    state, found = run_batch(_heated, (flows, keys, temperatures, discs))
     if not np.all(found):
         raise RuntimeError(
             "no packing without overlap was found: the packing fraction is too high for these "
@@ -351,7 +341,7 @@ def _heated_replica(
     return replace(state, velocities=velocities * jnp.sqrt(temperature / drawn)), found
 
 
-_heated = batch_program(_heated_replica)
+_heated = persistent_jit(_heated_replica)
 
 
 def _chunk(batch: Batch, strain: np.ndarray, advance: AdvanceBatch) -> tuple[Batch, Tally]:
@@ -364,9 +354,7 @@ def _advanced(batch: Batch, steps: np.ndarray, advance: AdvanceBatch) -> tuple[B
     is.
     """
     going_on = batch.status < GIVEN_UP
-    counts = jax.device_put(
-        np.where(going_on, steps, 0).astype(np.int32)
-    )  # jnp.asarray would compile a program for it
+    counts = np.where(going_on, steps, 0).astype(np.int32)
     state, tally = advance(batch.flow, batch.numerics, batch.state, counts)
     tally = jax.tree.map(np.asarray, tally)
     failed = np.where(
@@ -475,7 +463,7 @@ def _shortened(batch: Batch, flow: ShearFlow, advance: AdvanceBatch) -> Batch:
     ladders = [timestep_ladder(*ends) for ends in zip(coarse[:, None], final[:, None], strict=True)]
     for timesteps in zip_longest(*ladders, fillvalue=np.nan):
         active = np.isfinite(timesteps)
-        current = jax.device_put(np.where(active, timesteps, final).astype(batch.state.side.dtype))
+        current = np.where(active, timesteps, final).astype(batch.state.side.dtype)
         batch = batch._replace(flow=replace(flow, timestep=current))
         batch = _sheared(batch, np.where(active, _SHORTENING_STRAIN, 0.0), advance)
     batch = batch._replace(flow=flow)

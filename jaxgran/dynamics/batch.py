@@ -1,0 +1,322 @@
+"""Batches of replicas: their checks, and who advances them on which cores and devices.
+
+All arrays of a batch have a leading (replicas,) axis. The results of a replica do not depend on its
+batch, to the bit.
+
+==========================  ========================================================================
+where                       how the replicas of a batch advance
+==========================  ========================================================================
+a processor                 the compiled function of one replica is called for each, in threads on
+                            several cores (``run_batch``)
+an accelerator              in lockstep, in one compiled function of the batch
+several devices             each device advances its share; devices of all hosts that
+                            ``jax.distributed`` connects wait for each other at the end of a call
+                            only, and all hosts get all results
+within ``jit``, ``vmap``, … by ``vmap``, or in turn (``over_replicas``)
+==========================  ========================================================================
+"""
+
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from functools import partial
+from queue import SimpleQueue
+from threading import Event, Thread
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Float
+
+from jaxgran.dynamics.engine import Jax, Numerics, in_lockstep, select_engine
+from jaxgran.dynamics.interruption import PATIENCE, engines_stopped, waited
+from jaxgran.environment import usable_threads
+from jaxgran.model.checks import InputError, is_traced
+from jaxgran.model.control_flow import AXIS
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.state import State
+
+Arguments = tuple[Any, ...]  # a flow, a state and numbers
+Send = Callable[[Any], None]
+T = TypeVar("T")
+_DIMENSIONS = (1, 1, 2, 2, 0, 0)  # of the arrays of one state, in the order of its leaves
+_DEVICES = "devices"
+_MESSAGE, _RESULT, _ERROR = range(3)
+
+
+def stack(flows: Sequence[ShearFlow]) -> ShearFlow:
+    """The flows as one batch: a ShearFlow whose numbers have a leading (replicas,) axis."""
+
+    def joined(*values) -> np.ndarray:
+        numbers = np.stack([np.asarray(value) for value in values])
+        kind = numbers.dtype if numbers.dtype.kind == "f" else np.dtype(float)
+        return numbers.astype(jax.dtypes.canonicalize_dtype(kind))
+
+    return jax.tree.map(joined, *flows)
+
+
+def checked_batch(
+    check: Callable[..., Any], flow: Any, state: Any, *numbers: Any
+) -> Arguments | None:
+    """The arguments of a batch, broadcast to a leading (replicas,) axis; None where flow and state
+    are single ones.
+
+    Args:
+      check: called with the arguments of each replica, or of the first where JAX traces them;
+        raises an InputError.
+
+    Raises:
+      InputError: the axes differ in length, or there are several, or the arguments of a replica do
+        not pass.
+    """
+    batch = _batch_of(flow, state, *numbers)
+    for replica in _checked_replicas(batch) if batch else [(flow, state, *numbers)]:
+        check(*replica)
+    return batch
+
+
+def _batch_of(flow: Any, state: Any, *numbers: Any) -> Arguments | None:
+    if not (isinstance(flow, ShearFlow) and isinstance(state, State)):
+        return None
+    shapes = {*map(np.shape, jax.tree.leaves(flow)), np.shape(state.side)} - {()}
+    if not shapes:
+        return None
+    shapes |= {np.shape(x) for x in numbers} - {()}
+    if len(shapes) > 1 or len(max(shapes)) > 1:
+        raise InputError(
+            "a batch must have one axis of replicas, the same in the flow, the state and all "
+            "numbers, not those of "
+            f"{', '.join(map(str, sorted(shapes)))}."
+        )
+
+    def with_axis(x: Any, dimensions: int = 0) -> Any:
+        if not hasattr(x, "ndim"):
+            x = jnp.asarray(x, state.side.dtype if isinstance(x, float) else None)
+        return jnp.broadcast_to(x, (*max(shapes), *x.shape)) if x.ndim == dimensions else x
+
+    leaves, structure = jax.tree.flatten(state)
+    states = jax.tree.unflatten(structure, map(with_axis, leaves, _DIMENSIONS))
+    return jax.tree.map(with_axis, flow), states, *map(with_axis, numbers)
+
+
+def _checked_replicas(batch: Arguments) -> Iterator[Arguments]:
+    if is_traced(batch):
+        yield jax.tree.map(lambda x: x[0], batch)
+    else:
+        yield from replicas_of(batch)
+
+
+def replicas_of(batch: Any) -> Iterator[Any]:
+    """The replicas of a batch, with arrays of NumPy, of which one is taken without a compilation;
+    random keys stay with JAX.
+    """
+
+    def on_host(x: Any) -> Any:
+        is_key = jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
+        return x if is_key else np.asarray(x)
+
+    arrays = jax.tree.map(on_host, batch)
+    for k in range(len(jax.tree.leaves(arrays)[0])):
+        yield jax.tree.map(lambda x, k=k: x[k], arrays)
+
+
+def over_replicas(
+    function: Callable, numerics: Numerics, batch: Arguments, option: str = ""
+) -> Any:
+    """The function of one replica for a batch, with the engine that ``select_engine`` takes for it.
+
+    On a processor ``Numba`` advances the replicas by ``vmap``, and ``Jax`` in turn by ``lax.map``.
+    On an accelerator they advance in lockstep, by ``vmap`` with a named axis.
+    """
+    flow, state, *_ = batch
+    if in_lockstep():
+        return jax.vmap(function, axis_name=AXIS)(*batch)
+    if isinstance(select_engine(flow, numerics, state, option), Jax):
+        return lax.map(lambda replica: function(*replica), batch)
+    return jax.vmap(function)(*batch)
+
+
+def shear_batch(
+    function: Callable[..., Any],
+    numerics: Numerics,
+    batch: Arguments,
+    static: tuple = (),
+    option: str = "",
+) -> Any:
+    """The results of ``function(flow, state, strain, numerics, *static)``, compiled, for all
+    replicas of a batch; JAX may trace it.
+    """
+    if is_traced(batch, numerics):
+
+        def of_replica(*replica: Any) -> Any:
+            return function(*replica, numerics, *static)
+
+        return over_replicas(of_replica, numerics, batch, option)
+    flow, _, strain = batch
+    costs = predicted_cost(flow) * np.asarray(strain)
+    results = run_batch(function, batch, (numerics,), static, costs, usable_threads())
+    return jax.tree.map(jnp.asarray, results)
+
+
+def run_batch(
+    function: Callable[..., Any],
+    batch: Arguments,
+    shared: tuple = (),
+    static: tuple = (),
+    costs: Float[np.ndarray, " replicas"] | None = None,
+    threads: int = 1,
+) -> Any:
+    """The results of a function of one replica for all replicas of a batch, on all devices.
+
+    Args:
+      function: called as ``function(*replica, *shared, *static)``; compiled for one replica. So
+        batches of any size need no further compilation on a processor.
+      batch: arguments with a leading (replicas,) axis.
+      shared, static: arguments that all replicas have in common; the latter are not traced.
+      costs: relative cost of each replica. Threads begin with the most expensive ones.
+      threads: most threads on a processor.
+    """
+    if in_lockstep() or jax.device_count() > 1:
+        return waited(_together(function, static, in_lockstep(), shared, batch))
+    replicas = list(replicas_of(batch))
+
+    def run(k: int, _: Send = lambda _: None) -> Any:
+        return jax.tree.map(np.asarray, waited(function(*replicas[k], *shared, *static)))
+
+    order = range(len(replicas)) if costs is None else np.argsort(-costs, kind="stable").tolist()
+    if min(threads, len(replicas)) == 1:
+        results = {k: run(k) for k in order}
+    else:
+        tasks = in_threads(run, [(k,) for k in order], threads, lambda _: None)
+        results = {order[number]: result for number, result in tasks}
+    return jax.tree.map(lambda *x: np.array(x), *(results[k] for k in range(len(replicas))))
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _together(
+    function: Callable[..., Any], static: tuple, lockstep: bool, shared: tuple, batch: Arguments
+) -> Any:
+    """The replicas of a batch in lockstep or in turn, on each device an equal share of them; copies
+    of replicas fill up the last share.
+    """
+
+    def share(shared: tuple, batch: Arguments) -> Any:
+        def run(*replica: Any) -> Any:
+            return function(*replica, *shared, *static)
+
+        if lockstep:
+            return jax.vmap(run, axis_name=AXIS)(*batch)
+        return lax.map(lambda replica: run(*replica), batch)
+
+    def gathered(shared: tuple, batch: Arguments) -> Any:
+        results = share(shared, batch)
+        return jax.tree.map(lambda x: lax.all_gather(x, _DEVICES, tiled=True), results)
+
+    devices, count = jax.devices(), len(jax.tree.leaves(batch)[0])
+    if len(devices) == 1 or count == 1:
+        return share(shared, batch)
+    size = -(-count // len(devices))  # rounded up
+    filled = jax.tree.map(lambda x: x[np.arange(size * len(devices)) % count], batch)
+    everywhere, shares = PartitionSpec(), PartitionSpec(_DEVICES)
+    on_devices = jax.shard_map(
+        gathered,
+        mesh=Mesh(np.asarray(devices), (_DEVICES,)),
+        in_specs=(everywhere, shares),
+        out_specs=everywhere,
+        check_vma=False,
+    )
+    return jax.tree.map(lambda x: x[:count], on_devices(shared, filled))
+
+
+def predicted_cost(flow: ShearFlow, timestep: Any = None) -> Any:
+    """Relative cost of a unit of strain of a flow, or of each of a batch, at its own or another
+    time step: a fit to measured times.
+
+    The cost is proportional to the number of grains. Dense and dissipative flows form contact
+    networks; the second factor is their cost at dt = 1e-3. Steps without a contact are jumped over,
+    so ten times as many steps cost little more than twice as much.
+    """
+    numbers = flow.restitution, flow.packing_fraction, timestep or flow.timestep
+    alpha, nu, dt = (np.asarray(x, float) for x in numbers)
+    network = 8 + 600 * (1 - alpha) * np.exp((nu - 0.8) / 0.04)
+    return flow.grains * network * (1e-3 / dt) ** 0.35
+
+
+class Cancelled(BaseException):
+    """Raised by the ``send`` of a task whose result is no longer wanted."""
+
+
+def in_threads(
+    function: Callable[..., T], tasks: Sequence[tuple], threads: int, on_message: Send
+) -> Generator[tuple[int, T]]:
+    """Run a function on the arguments of every task, started in order in threads of this process,
+    and yield each result when it is there. Compiled programs run without the interpreter's lock.
+
+    When the generator ends early, each thread ends at its next message. Ctrl-C also stops the numba
+    engine, within one step. A thread that takes longer, as for a compilation, is left behind;
+    Python ends after it.
+
+    Args:
+      function: called with the arguments of a task and ``send``. A long task calls ``send`` after
+        each of its parts, before it uses what the part returned: a part that was stopped has no
+        valid results, and ``send`` then raises.
+      tasks: arguments of each call.
+      threads: most threads at a time.
+      on_message: called with everything that is sent, in the thread of the caller.
+
+    Yields:
+      The number of the task, and its result.
+
+    Raises:
+      BaseException: that of a task, with its traceback.
+    """
+    waiting, cancelled = iter(list(enumerate(tasks))), Event()  # the threads share this iterator
+    events: SimpleQueue[tuple[int, Any]] = SimpleQueue()
+    config: Any = jax.config
+    x64, device = config.jax_enable_x64, config.jax_default_device
+
+    def send(message: Any) -> None:
+        if cancelled.is_set():
+            raise Cancelled
+        events.put((_MESSAGE, message))
+
+    def work() -> None:
+        with jax.enable_x64(x64), jax.default_device(device):  # each thread has its own
+            for number, arguments in waiting:
+                try:
+                    events.put((_RESULT, (number, function(*arguments, send))))
+                except BaseException as error:
+                    events.put((_ERROR, error))
+                    return
+
+    running = [Thread(target=work, name=f"jaxgran-{k}") for k in range(min(threads, len(tasks)))]
+    for thread in running:
+        thread.start()
+    unfinished = len(tasks)
+    try:
+        while unfinished:
+            kind, content = events.get()
+            if kind == _ERROR:
+                raise content
+            if kind == _MESSAGE:
+                on_message(content)
+            else:
+                unfinished -= 1
+                yield content
+    except KeyboardInterrupt:
+        cancelled.set()
+        with engines_stopped():
+            _join(running)
+        raise
+    finally:
+        cancelled.set()
+        _join(running)
+
+
+def _join(threads: Iterable[Thread]) -> None:
+    """Wait for the end of the threads, but not for long."""
+    end = time.monotonic() + PATIENCE
+    for thread in threads:
+        thread.join(max(0.0, end - time.monotonic()))
