@@ -120,11 +120,10 @@ def advance_blocks(
     """
     if isinstance(select_engine(flow, numerics, state), Numba):
         return _numba_blocks(flow, numerics.solver, state, steps)
-
-    def block(state: State, steps: Array) -> tuple[State, Tally]:
-        return advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
-
-    return lax.scan(block, state, steps)
+    if in_batch():
+        return _blocks_by_jax(flow, numerics.solver, state, steps)
+    arrays = jax.tree.map(jnp.asarray, (flow, numerics.solver, state, steps))
+    return _jax_blocks(*arrays)
 
 
 @cache
@@ -230,6 +229,7 @@ def numba_memory(flow: ShearFlow) -> jax.ShapeDtypeStruct:
 
 _numba_engine = with_forward_derivative(_advance_by_numba, advance_by_jax)
 _numba_blocks = with_forward_derivative(_blocks_by_numba, _blocks_by_jax)
+_jax_blocks = with_forward_derivative(with_own_batching(_blocks_by_jax), _blocks_by_jax)
 
 
 def call_numba(

@@ -57,7 +57,7 @@ class Journal:
         flow: ShearFlow,
         numerics: Numerics,
         state: State,
-        steps: Array,
+        steps: Array | np.ndarray,
         observe: Observable | None = None,
     ) -> tuple[State, Tally]:
         k, self.position = self.position, self.position + 1

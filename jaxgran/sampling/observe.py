@@ -37,7 +37,7 @@ Observable = Callable[[Snapshot], Any]  # returns a pytree of arrays to average
 
 # Advances each replica of a batch by its number of steps, (replicas,), and a wrapper that adds
 # reports or records and leaves the states alone.
-AdvanceBatch = Callable[[ShearFlow, Numerics, State, Array], tuple[State, Tally]]
+AdvanceBatch = Callable[[ShearFlow, Numerics, State, Array | np.ndarray], tuple[State, Tally]]
 AdvanceWrapper = Callable[[AdvanceBatch], AdvanceBatch]
 # Called with time step and number of steps of each replica.
 Report = Callable[[ArrayLike, ArrayLike], None]
@@ -51,7 +51,7 @@ class ObserveBatch(Protocol):
         flow: ShearFlow,
         numerics: Numerics,
         state: State,
-        steps: Array,
+        steps: Array | np.ndarray,
         observe: Observable | None = None,
     ) -> tuple[State, Tally]: ...
 
@@ -60,7 +60,7 @@ def advance_batch(
     flow: ShearFlow,
     numerics: Numerics,
     state: State,
-    steps: Array,
+    steps: Array | np.ndarray,
     observe: Observable | None = None,
     threads: int = 1,
 ) -> tuple[State, Tally]:
@@ -104,7 +104,7 @@ def reporting(advance: ObserveBatch, report: Report) -> ObserveBatch:
         flow: ShearFlow,
         numerics: Numerics,
         state: State,
-        steps: Array,
+        steps: Array | np.ndarray,
         observe: Observable | None = None,
     ) -> tuple[State, Tally]:
         state, tally = advance(flow, numerics, state, steps, observe)

@@ -52,7 +52,12 @@ class Recorder:
         return partial(self._advance, advance)
 
     def _advance(
-        self, advance: AdvanceBatch, flow: ShearFlow, numerics: Numerics, state: State, steps: Array
+        self,
+        advance: AdvanceBatch,
+        flow: ShearFlow,
+        numerics: Numerics,
+        state: State,
+        steps: Array | np.ndarray,
     ) -> tuple[State, Tally]:
         if self.frames == 0:
             self._record(flow, numerics, state)

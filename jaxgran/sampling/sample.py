@@ -313,8 +313,8 @@ def sample(
 
     A batch is a flow or a state whose arrays have a leading (replicas,) axis; what lacks it is the
     same for all. Each replica has the results of its own call. ``jax.vmap`` of this function does
-    the same. A batch is faster with the engine ``Jax``, and is compiled for 1, 2, 4, 8, … replicas
-    only.
+    the same. A batch is shared out to all cores of a processor, and batches of any size need one
+    compilation there.
 
     The numba engine takes all blocks in one call, unless there is ``observe`` or ``callback``. Then
     every block begins with a new list of near pairs, and its trajectory differs by rounding, which

@@ -168,7 +168,7 @@ def prepare(
 
 def prepare_batch(
     flow: ShearFlow,
-    keys: Array,
+    keys: Array | np.ndarray,
     equilibrate: float | None = None,
     advance: AdvanceBatch = advance_batch,
     grains: Grains | None = None,
