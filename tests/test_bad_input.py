@@ -40,8 +40,8 @@ from jaxgran.analysis import fields
 from jaxgran.contact.residuals import contact_residuals
 from jaxgran.dynamics import snapshots
 from jaxgran.io.trajectory import check_trajectory
+from jaxgran.maps import automatic, settings_checks
 from jaxgran.maps import ratio_map as ratio_map_module
-from jaxgran.maps import settings as map_settings
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 from jaxgran.plotting import theory
@@ -82,7 +82,8 @@ def nothing_runs() -> Iterator[None]:
             (ratio_map_module, "run_replicas"),
         ):
             patch.setattr(module, name, would_run)
-        patch.setattr(map_settings, "_temperature", cold)
+        for module in (automatic, settings_checks):
+            patch.setattr(module, "temperature_of", cold)
         yield
 
 

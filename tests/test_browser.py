@@ -16,8 +16,7 @@ from command_line import jaxgran
 from pages import MARKUP, browser, open_page, page_map
 
 import jaxgran as jg
-from jaxgran.maps.parameters import RunParameters
-from jaxgran.maps.settings import chosen_settings
+from jaxgran.maps.automatic import chosen_settings
 
 pytestmark = pytest.mark.environment
 
@@ -270,7 +269,7 @@ def test_copied_are_the_table_and_a_command_that_runs(
     measured = Mock(side_effect=SystemExit(0))
     monkeypatch.setattr("jaxgran.maps.ratio_map.ratio_map", measured)
     assert jaxgran(tmp_path, *command[1:]).status == 0
-    settings, point = chosen_settings(RunParameters(**measured.call_args.kwargs))[0], here(map_page)
+    settings, point = chosen_settings(measured.call_args.kwargs)[0], here(map_page)
     (flow,) = settings.flows()
     assert {name: getattr(flow, name) for name in point} == point
     assert (settings.grains, settings.seeds, settings.activation) == (64, 2, "midpoint")

@@ -8,9 +8,10 @@ import xarray as xr
 from made_up_maps import with_variables
 from synthetic import random_replica, refused
 
+from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.results import choices_of, is_finished, open_map, write_dataset
+from jaxgran.maps.results import is_finished, open_map, write_dataset
 from jaxgran.maps.schema import flattened, path_of
 from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.settings import MapSettings
@@ -325,4 +326,4 @@ def test_grains_chosen_by_point_are_in_the_file_and_change_the_error(tmp_path: P
             point.pressure_ci95.sel(error_source="size") / abs(point.pressure)
         ) == pytest.approx(expected)
     write_dataset(with_variables(found, *FEW), tmp_path / "map.nc")
-    assert MapSettings(**choices_of(open_map(tmp_path / "map.nc"))) == chosen
+    assert MapSettings(**from_attrs(open_map(tmp_path / "map.nc"))) == chosen

@@ -17,9 +17,10 @@ from jaxgran.cache import persistent_jit
 from jaxgran.contact.projected_methods import solver_name
 from jaxgran.dynamics import advance
 from jaxgran.dynamics.engine import Numerics, _warn_once, in_lockstep, select_engine
+from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.dataset import map_dataset
-from jaxgran.maps.results import choices_of
 from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.settings_checks import require_engine
 
 STEPS = jnp.int32(100)
 SETTINGS = MapSettings((0.5, 0.9), (0.6,), grains=64, seeds=1, strain=2.0)
@@ -164,14 +165,14 @@ def test_a_dataset_names_what_ran_and_what_was_asked_for(
     )
     assert (data.attrs["engine_requested"], data.attrs["solver_requested"]) == requested
     assert (data.attrs["tolerance"], data.attrs["max_steps"]) == (settings.solver.tolerance, 5000)
-    assert MapSettings(**choices_of(data)) == settings
+    assert MapSettings(**from_attrs(data)) == settings
 
 
 def test_in_single_precision_a_map_is_of_the_engine_jax() -> None:
     with jax.enable_x64(False):
         data = map_dataset(SETTINGS, {}, {})
         assert "in float32, not numba" in refusal(
-            lambda: replace(SETTINGS, engine=jg.Numba()).require_engine()
+            lambda: require_engine(replace(SETTINGS, engine=jg.Numba()))
         )
     assert (data.attrs["precision"], data.attrs["engine"], data.attrs["solver"]) == (
         "float32",

@@ -11,9 +11,10 @@ from synthetic import refused
 
 from jaxgran.io.atomic import read_arrays
 from jaxgran.maps import checkpoint, journal
+from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.own_observables import identity_of
 from jaxgran.maps.ratio_map import ratio_map
-from jaxgran.maps.results import choices_of, open_map
+from jaxgran.maps.results import open_map
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 
@@ -113,7 +114,7 @@ def test_an_unfinished_map_goes_on_to_the_same_bits_with_the_same_function_only(
     ):
         ratio_map(**MAP, output=output, resume=True)
     with refused("must be a function that is passed to `ratio_map`"):
-        MapSettings(**choices_of(data))
+        MapSettings(**from_attrs(data))
 
 
 def test_what_a_function_computes_counts_and_not_its_place() -> None:

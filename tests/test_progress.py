@@ -5,11 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jaxgran.maps.automatic import chosen_settings
 from jaxgran.maps.batches import predicted_cost
-from jaxgran.maps.parameters import MapParameters
 from jaxgran.maps.progress import Meter
 from jaxgran.maps.replica import Advance
-from jaxgran.maps.settings import chosen_settings
 
 MAP: dict[str, Any] = {
     "restitution": (0.2, 0.9),
@@ -17,7 +16,7 @@ MAP: dict[str, Any] = {
     "grains": 64,
     "timestep": 1e-4,
 }
-SETTINGS, _ = chosen_settings(MapParameters(**MAP, seeds=2, strain=4.0, equilibrate=1.0))
+SETTINGS, _ = chosen_settings({**MAP, "seeds": 2, "strain": 4.0, "equilibrate": 1.0})
 
 
 def shares(meter: Meter) -> tuple[str, str]:

@@ -3,7 +3,7 @@ grid.
 """
 
 import inspect
-from dataclasses import fields, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,14 +19,14 @@ from synthetic import random_replica
 from jaxgran.io.atomic import read_arrays
 from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps import run_replicas as run_replicas_module
+from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.batches import batches, predicted_cost
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.interruption import Interrupted
-from jaxgran.maps.parameters import RunParameters
 from jaxgran.maps.ratio_map import ratio_map
 from jaxgran.maps.replica import Advance, Key, Replica
-from jaxgran.maps.results import choices_of, open_map
-from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.results import open_map
+from jaxgran.maps.settings import DEFAULTS, OPTIONS, MapSettings
 from jaxgran.maps.status_report import BadPoints
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
@@ -312,16 +312,15 @@ def test_first_of_several_numbers_of_grains_has_the_numbers_of_a_map_at_it_alone
     xr.testing.assert_equal(first, alone.to_dataset())
     assert not np.any(data.pressure[0] == data.pressure[1])
     assert (
-        set(choices_of(data)["grains"]) == {32, 64}
-        and choices_of(data.sel(grains=64))["grains"] == 64
+        set(from_attrs(data)["grains"]) == {32, 64}
+        and from_attrs(data.sel(grains=64))["grains"] == 64
     )
 
 
 def test_the_function_has_the_arguments_of_the_table_and_says_what_they_mean() -> None:
-    assert list(inspect.signature(ratio_map).parameters) == [
-        row.name for row in fields(RunParameters)
-    ]
-    for row in fields(RunParameters):
-        assert f"{row.name}: {row.metadata['option'].help}" in str(ratio_map.__doc__)
+    arguments = inspect.signature(ratio_map).parameters
+    assert [(name, one.default) for name, one in arguments.items()] == [*DEFAULTS.items()]
+    for name, option in OPTIONS.items():
+        assert f"{name}: {option.help}" in str(ratio_map.__doc__)
     with pytest.raises(TypeError, match="restitutions"):
         ratio_map(restitutions=[0.5], packing_fraction=[0.6])  # type: ignore[call-arg]

@@ -2,7 +2,7 @@
 anything runs.
 """
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -12,9 +12,9 @@ from synthetic import refused
 
 from jaxgran.cli.map import MAP_OPTIONS
 from jaxgran.contact.projected_methods import Jacobi
-from jaxgran.maps.parameters import MapParameters, RunParameters
+from jaxgran.maps.automatic import chosen_settings
 from jaxgran.maps.presets import PRESETS, with_start
-from jaxgran.maps.settings import MapSettings, chosen_settings
+from jaxgran.maps.settings import OPTIONS, MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import MAX_GRAINS
 from jaxgran.sampling.budget import size_error
@@ -60,7 +60,7 @@ def test_grains_and_time_step_are_axes_where_they_are_lists_and_then_the_slowest
 
 
 def chosen(**parameters: Any) -> tuple[MapSettings, str]:
-    return chosen_settings(MapParameters(**parameters))
+    return chosen_settings(parameters)
 
 
 def test_automatic_time_step_does_not_depend_on_the_numbers_of_grains() -> None:
@@ -118,10 +118,7 @@ def test_the_command_and_the_function_start_alike() -> None:
     the terminal.
     """
     python_only = {"observe", "grains_by_point", "progress", "record", "attributes"}
-    assert (
-        set(MAP_OPTIONS) - {"format", "quiet"}
-        == {one.name for one in fields(RunParameters)} - python_only
-    )
+    assert set(MAP_OPTIONS) - {"format", "quiet"} == set(OPTIONS) - python_only
     assert with_start({}) == PRESETS["quick"]
     assert (
         with_start({"error": 0.1}).items()

@@ -12,10 +12,11 @@ from flows import in_batches
 from synthetic import random_replica, random_state
 
 from jaxgran.maps import run_replicas as run_replicas_module
+from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.results import choices_of, open_map, write_dataset
+from jaxgran.maps.results import open_map, write_dataset
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.states import first_of_points, instant_at, states_of
 from jaxgran.model.cell import minimum_image
@@ -88,7 +89,7 @@ def test_a_file_has_the_state_of_each_point(tmp_path: Path) -> None:
     assert set(found) == set(expected) == {0, 1, 3}
     for point, state in expected.items():
         jax.tree.map(np.testing.assert_array_equal, found[point], state)
-    assert MapSettings(**choices_of(data)) == settings
+    assert MapSettings(**from_attrs(data)) == settings
     assert "states" not in map_dataset(replace(settings, snapshots=False), written, {}).children
 
 

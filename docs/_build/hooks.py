@@ -33,9 +33,8 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from jaxgran.cli.arguments import placeholder
 from jaxgran.cli.mistakes import option_name, with_options
-from jaxgran.maps.parameters import options as parameters
+from jaxgran.maps.settings import options as parameters
 from jaxgran.maps.results import open_map
 from jaxgran.page.explore import explore
 from jaxgran.sampling.observables import OBSERVABLES
@@ -122,7 +121,7 @@ def options(command: str) -> str:
             flag, meaning = f"{flag} NAME", (f"{meaning} One of "
                                             f"{', '.join(f'`{choice}`' for choice in one.kind)}.")
         elif one.kind is not bool:
-            flag = f"{flag} {placeholder(one)}".replace("|auto", " or auto")
+            flag = f"{flag} {one.placeholder}".replace("|auto", " or auto")
         elif one.off:
             flag = f"{flag}, --no-{name}"
         rows.append(f"| `{flag}` | {meaning} | {one.default or '–'} |")

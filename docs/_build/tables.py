@@ -11,7 +11,7 @@ from typing import Any
 
 import griffe
 
-from jaxgran.maps.parameters import table as parameters
+from jaxgran.maps.settings import table as parameters
 
 _BORDER = re.compile(r"^ *=+( +=+)+ *$")
 _ROLE = re.compile(r":(?:func|class|mod|meth|data):`~?([^`]+)`")

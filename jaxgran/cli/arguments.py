@@ -6,14 +6,16 @@ is an ``InputError``.
 
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from jaxgran.cli.mistakes import option_name, with_options
-from jaxgran.maps.parameters import Command, Option, default, is_new_dimension, options
+from jaxgran.maps.options import Command, Option
 from jaxgran.maps.presets import PRESETS
+from jaxgran.maps.settings import DEFAULTS, is_new_dimension, options
 from jaxgran.model.checks import refused, require
 from jaxgran.model.choices import MAX_REPLICAS
 
@@ -31,18 +33,17 @@ def of_map(command: Command) -> dict[str, Option]:
 
 
 def _as_offered(name: str, one: Option, command: Command) -> Option:
-    single = {"several": False} if command == "run" else {}
-    words = one.help + (
-        " A list adds a dimension." if command == "map" and is_new_dimension(name) else ""
-    )
-    text = one.default
+    start, text = DEFAULTS[name], one.default
     if command == "run" and name in ("restitution", "packing_fraction"):
         text = None
     elif command == "map" and name in PRESETS["quick"]:
         text = "of the preset"
-    elif text is None and one.kind is not bool and default(name) is not None:
-        text = f"{default(name):g}" if isinstance(default(name), float) else str(default(name))
-    return Option(**{**vars(one), "help": words, "default": text, **single})
+    elif text is None and one.kind is not bool and start is not None:
+        text = f"{start:g}" if isinstance(start, float) else str(start)
+    if command == "run":
+        return replace(one, default=text, several=False)
+    words = " A list adds a dimension." if is_new_dimension(name) else ""
+    return replace(one, default=text, help=one.help + words)
 
 
 def command(
@@ -72,24 +73,20 @@ def command(
     parameters = []
     if argument is not None:
         words = argument.help + (f" [default: {argument.default}]" if argument.default else "")
-        first, kind = (None, kind | None) if argument.default else (..., kind)
-        parameters = [
-            _parameter(place, kind, typer.Argument(help=words, show_default=False), first)
-        ]
+        declared = typer.Argument(help=words, show_default=False)
+        parameters.append(_parameter(place, kind, declared, not argument.default))
     for name, one in table.items():
         kind = one.kind if one.kind in (bool, Path) else str
-        first = ... if name in required else None
-        parameters.append(
-            _parameter(name, kind if first is ... else kind | None, _declared(name, one), first)
-        )
+        parameters.append(_parameter(name, kind, _declared(name, one), name in required))
     parsed.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return parsed
 
 
-def _parameter(name: str, kind: Any, declared: Any, first: Any) -> inspect.Parameter:
-    first = inspect.Parameter.empty if first is ... else first
+def _parameter(name: str, kind: Any, declared: Any, required: bool) -> inspect.Parameter:
+    start = inspect.Parameter.empty if required else None
+    annotation = Annotated[kind if required else kind | None, declared]
     return inspect.Parameter(
-        name, inspect.Parameter.KEYWORD_ONLY, default=first, annotation=Annotated[kind, declared]
+        name, inspect.Parameter.KEYWORD_ONLY, default=start, annotation=annotation
     )
 
 
@@ -102,18 +99,10 @@ def _declared(name: str, one: Option) -> Any:
     words += f" [default: {one.default}]" if one.default else ""
     choices = one.kind if isinstance(one.kind, tuple) else ("auto",) if one.auto else ()
     completion = (lambda: list(choices)) if choices else None
-    metavar = None if one.kind is bool else placeholder(one)
+    metavar = None if one.kind is bool else one.placeholder
     return typer.Option(
         *names, help=words, metavar=metavar, show_default=False, autocompletion=completion
     )
-
-
-def placeholder(one: Option) -> str:
-    """What stands for the value of an option in a help text."""
-    if isinstance(one.kind, tuple):
-        return "|".join(one.kind)
-    kind = one.example or {float: "NUMBER", int: "INTEGER", Path: "FILE"}.get(one.kind, "TEXT")
-    return ("LIST" if one.several or one.values else kind) + ("|auto" if one.auto else "")
 
 
 def value(name: str, one: Option, text: Any) -> Any:

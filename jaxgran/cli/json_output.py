@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxgran.maps.parameters import Option
+from jaxgran.maps.options import Option
 
 JSON = Option(
     "Print one JSON object in place of tables: value, stderr, unit and meaning by name.", bool

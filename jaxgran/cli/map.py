@@ -12,7 +12,7 @@ from jaxgran.cli.arguments import FILE, QUIET, command, of_map
 from jaxgran.cli.measure import finish, print_budget, run_map
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import say_written
-from jaxgran.maps.parameters import Option
+from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.choices import FileFormat
 from jaxgran.model.display import with_error
@@ -63,7 +63,7 @@ def run_map_command(format: FileFormat = "png", quiet: bool = False, **given: An
     overwrite, existed = given.get("overwrite", False), os.path.exists(output)
     if whole and not overwrite:
         require_new_figures(output, format)
-    data, interrupted, written = run_map(given, quiet, "jaxgran.plotting.map_figures")
+    data, interrupted, written = run_map(given, quiet)
     pictures = (
         []
         if interrupted

@@ -6,9 +6,7 @@ import sys
 import warnings
 from collections.abc import Mapping
 from contextlib import suppress
-from importlib import import_module
 from pathlib import Path
-from threading import Thread
 from typing import Any, NamedTuple
 
 from jaxgran.cli.mistakes import with_options
@@ -23,7 +21,7 @@ from jaxgran.cli.terminal import (
     stop_interrupted,
 )
 from jaxgran.maps.interruption import Interrupted
-from jaxgran.maps.parameters import options
+from jaxgran.maps.settings import options
 from jaxgran.model.checks import refused
 
 _BUDGETED = (
@@ -43,8 +41,8 @@ class Outcome(NamedTuple):
     written: bool
 
 
-def run_map(parameters: Mapping[str, Any], quiet: bool, load: str = "") -> Outcome:
-    """Run ``ratio_map`` on all cores, with progress; import the module ``load`` meanwhile."""
+def run_map(parameters: Mapping[str, Any], quiet: bool) -> Outcome:
+    """Run ``ratio_map`` on all cores, with progress."""
     configured_jax()
     require_device()
     from jaxgran.maps.ratio_map import ratio_map
@@ -55,8 +53,6 @@ def run_map(parameters: Mapping[str, Any], quiet: bool, load: str = "") -> Outco
         "attributes": {"command": command_line()},
         **_numerics(parameters),
     }
-    if load:
-        Thread(target=_load, args=(load,), name="jaxgran-load").start()
     output = given.get("output")
     before, interrupted = _stamp(output), False
     with warnings.catch_warnings():
@@ -103,11 +99,6 @@ def _stamp(path: Path | None) -> tuple[int, int] | None:
         status = os.stat(path)  # type: ignore[arg-type]
         return status.st_ino, status.st_mtime_ns
     return None
-
-
-def _load(module: str) -> None:
-    with suppress(Exception):  # an error comes back where the module is used
-        import_module(module)
 
 
 def _say_imprecise(data) -> None:

@@ -7,7 +7,8 @@ from jaxgran.cli.arguments import OVERWRITE, command
 from jaxgran.cli.map import MAP_OPTIONS, draw_beside, print_tables, require_new_figures
 from jaxgran.cli.measure import command_line, finish
 from jaxgran.cli.terminal import configured_jax, require_device
-from jaxgran.maps.parameters import Option, option
+from jaxgran.maps.options import Option
+from jaxgran.maps.settings import OPTIONS
 from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.choices import FileFormat
 
@@ -17,7 +18,7 @@ MERGE_EXAMPLES = {
     "more.nc --output both.nc",
 }
 MERGE_OPTIONS = {
-    "output": option("output"),
+    "output": OPTIONS["output"],
     "overwrite": OVERWRITE,
     "format": MAP_OPTIONS["format"],
 }

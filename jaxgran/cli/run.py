@@ -12,7 +12,7 @@ from jaxgran.cli.json_output import JSON, Entry, print_json
 from jaxgran.cli.measure import finish, print_budget, run_map
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import configured_jax, counted, say
-from jaxgran.maps.parameters import Option
+from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, require_number, short_repr
 from jaxgran.model.display import unit_text, with_error
 

@@ -3,7 +3,7 @@
 from jaxgran.cli.arguments import command
 from jaxgran.cli.json_output import JSON, Entry, print_json
 from jaxgran.cli.tables import Table, plain, print_table
-from jaxgran.maps.parameters import Option
+from jaxgran.maps.options import Option
 from jaxgran.model.display import with_error
 from jaxgran.reference.table import FACTORS, MEASURED, THEORIES, shipped_table
 from jaxgran.reference.validity import COLUMNS, Validity, validity

@@ -19,26 +19,23 @@ journal is removed, and its replicas are computed again.
 """
 
 import glob
-import hashlib
-import json
 import os
 import shutil
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxgran.contact.projected_methods import solver_text
 from jaxgran.dynamics.tally import TABLE, flat_tally, tally_from_flat
 from jaxgran.environment import default_device, precision
 from jaxgran.files import same_file
 from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
-from jaxgran.maps.own_observables import identity_of, sums_by_name
+from jaxgran.maps.attributes import digest, first_difference, identity
+from jaxgran.maps.own_observables import sums_by_name
 from jaxgran.maps.provenance import made_with, versions_of
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
@@ -75,9 +72,7 @@ class Checkpoint:
         self.done: dict[Key, Replica] = {}
         self.damaged: list[str] = []
         self._identity = _identity(settings)
-        self._name = hashlib.sha256(
-            json.dumps(self._identity, sort_keys=True).encode()
-        ).hexdigest()[:12]
+        self._name = digest(self._identity)
         self._ended: list[Path] = []  # journals of the batches that map.nc lacks
         self._next_write = 0.0
         self._lock = _locked(self.folder, output)
@@ -202,13 +197,12 @@ class Checkpoint:
 
     def _require_same(self, begun: Mapping[str, object]) -> None:
         """Raise an InputError with the first difference between this map and the unfinished one."""
-        for name, value in self._identity.items():
-            if begun.get(name) != value:
-                raise InputError(
-                    f"the unfinished map in {str(self.folder)!r} has {name} {begun.get(name)!r}, "
-                    f"not {value!r}: "
-                    "resume it with the same parameters, or remove the folder."
-                )
+        if difference := first_difference(self._identity, begun):
+            name, here, there = difference
+            raise InputError(
+                f"the unfinished map in {str(self.folder)!r} has {name} {there!r}, not {here!r}: "
+                "resume it with the same parameters, or remove the folder."
+            )
 
 
 def _arrays_of(replicas: Mapping[Key, Replica]) -> dict[str, np.ndarray]:
@@ -252,25 +246,15 @@ def _replicas_of(arrays: Mapping[str, np.ndarray], settings: MapSettings) -> dic
     return replicas
 
 
-def _identity(settings: MapSettings) -> dict[str, object]:
+def _identity(settings: MapSettings) -> dict[str, Any]:
     """All that the results depend on, bit for bit, in types of JSON."""
-    versions = versions_of(made_with())
-    here = {
+    return {
+        **identity(settings),
+        **versions_of(made_with()),
         "precision": precision(),
         "device": default_device().platform,
         "number of running sums": len(TABLE),
     }
-    parameters = {field.name: getattr(settings, field.name) for field in fields(settings)}
-    engine = "auto" if settings.engine is None else settings.engine.name
-    identity = {
-        **parameters,
-        "solver": solver_text(settings.solver),
-        "engine": engine,
-        "observe": identity_of(settings),
-        **versions,
-        **here,
-    }
-    return json.loads(json.dumps(identity, default=lambda number: number.item()))
 
 
 def _locked(folder: Path, output: Path) -> int | None:

@@ -2,22 +2,21 @@
 the run.
 """
 
-import json
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from jaxgran.contact.projected_methods import solver_name, solver_numbers
 from jaxgran.dynamics.engine import select_engine, solver_in_use
+from jaxgran.maps.attributes import to_attrs
 from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.confidence import confidence_variables
 from jaxgran.maps.conventions import CONVENTIONS, follow_conventions
 from jaxgran.maps.diagnostics import diagnostic_variables, observable_coordinate
-from jaxgran.maps.own_observables import identity_of, own_variables
+from jaxgran.maps.own_observables import own_variables
 from jaxgran.maps.points import PointAverages, PointGrid, point_averages
 from jaxgran.maps.provenance import made_with
 from jaxgran.maps.replica import Key, Replica
@@ -212,7 +211,7 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     title, Conventions          what the file is, and the version of the CF conventions
     format_version              of the groups and names in the file; files of another one are
                                 refused
-    restitution, …, first_seed  the settings by their names in ``ratio_map``
+    restitution, …, first_seed  the settings by their names in ``ratio_map``, see ``to_attrs``
     engine, solver              what ran; numbers of grains, preparation and sample may have
                                 different ones on a GPU
     engine_requested, solver_requested  what was asked for
@@ -240,31 +239,15 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     replica_steps_per_second
     ==========================  ====================================================================
     """
-    parameters = {field.name: getattr(settings, field.name) for field in fields(settings)}
-    equilibrate = parameters.pop("equilibrate")
-    if settings.error is not None:
-        del parameters["strain"]  # it differs between seeds: see ``strain`` of the group seeds
-    if settings.diameters is not None:
-        del parameters["polydispersity"]
-    parameters["observe"] = identity_of(settings)
-    parameters = {name: value for name, value in parameters.items() if value is not None}
-    flow, numbers = settings.flows()[0], solver_numbers(settings.solver)
     return {
         "title": "Ratio of the mean contact force to that of binary collisions in simple shear of "
         "hard discs",
         "Conventions": CONVENTIONS,
         "format_version": FORMAT_VERSION,
-        **{name: list(x) if isinstance(x, tuple) else x for name, x in parameters.items()},
-        "snapshots": int(settings.snapshots),  # NetCDF has no True and False
-        "engine_requested": "auto" if settings.engine is None else settings.engine.name,
-        "solver_requested": solver_name(settings.solver),
-        "solver_parameters": json.dumps(numbers),
-        "tolerance": numbers["tolerance"],
-        "max_steps": numbers["max_steps"],
-        "equilibrate": "until steady" if equilibrate is None else equilibrate,
+        **to_attrs(settings),
         "timestep_unit": "1 / shear rate",
         "strain_meaning": "sampled strain of each seed; where none is given, see seeds/strain",
-        "shear_rate": flow.shear_rate,
+        "shear_rate": settings.flows()[0].shear_rate,
         "size_distribution": _UNIFORM if settings.diameters is None else _GIVEN,
         **({} if settings.part is None else {"part_points": points_of_part(settings)}),
         **made_with(),

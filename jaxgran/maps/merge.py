@@ -4,17 +4,21 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import jax
+import xarray as xr
+
+from jaxgran.contact.projected_methods import ProjectedMethod, solver_text
+from jaxgran.maps.attributes import first_difference, from_attrs, identity
+from jaxgran.maps.dataset import map_dataset
+from jaxgran.maps.own_observables import identity_of
 from jaxgran.maps.provenance import DECIDING
 from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.results import open_map
+from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.sums import replicas_of
 from jaxgran.model.checks import InputError, short_repr
-
-if TYPE_CHECKING:
-    import xarray as xr
-
-    from jaxgran.contact.projected_methods import ProjectedMethod
-    from jaxgran.maps.settings import MapSettings
 
 _OF_PARTS = ("first_seed", "seeds", "part")  # in which the maps may differ
 _SUMMED = ("wall_time_seconds", "resumed_replicas")
@@ -22,10 +26,10 @@ _EQUAL = ("precision", "code_digest", *(f"version_{name}" for name in DECIDING))
 
 
 def merge_maps(
-    maps: "Sequence[xr.DataTree | str | Path]",
+    maps: Sequence[xr.DataTree | str | Path],
     observe: Callable[..., Any] | None = None,
-    solver: "ProjectedMethod | None" = None,
-) -> "xr.DataTree":
+    solver: ProjectedMethod | None = None,
+) -> xr.DataTree:
     """One map of the replicas of several maps: of parts, of other seeds, or of both.
 
     The result is that of one run, bit for bit: averages, standard errors and all else are computed
@@ -53,72 +57,56 @@ def merge_maps(
       >>> merged["seeds"].sizes["seed"]
       2
     """
-    import jax
-    from xarray import DataTree
-
-    from jaxgran.contact.projected_methods import solver_text
-    from jaxgran.maps.results import choices_of, open_map
-    from jaxgran.maps.settings import MapSettings
-
-    accepted = (str, os.PathLike, DataTree)
-    if (
-        not isinstance(maps, (list, tuple))
-        or not maps
-        or not all(isinstance(one, accepted) for one in maps)
-    ):
+    path = (str, os.PathLike)
+    is_list = isinstance(maps, (list, tuple)) and len(maps) > 0
+    if not is_list or not all(isinstance(one, (*path, xr.DataTree)) for one in maps):
         raise InputError(
             f"maps must be a list of at least one map or file, not {short_repr(maps)}."
         )
     names = [
-        short_repr(str(one)) if isinstance(one, (str, os.PathLike)) else f"map {k}"
-        for k, one in enumerate(maps)
+        short_repr(str(one)) if isinstance(one, path) else f"map {k}" for k, one in enumerate(maps)
     ]
-    opened = [open_map(one) if isinstance(one, (str, os.PathLike)) else one for one in maps]
-    chosen = [choices_of(one) for one in opened]
-    for name, one, data in zip(names, chosen, opened, strict=True):
-        _require_same(names[0], chosen[0], name, one, [*chosen[0], *one], _OF_PARTS)
-        _require_same(names[0], opened[0].attrs, name, data.attrs, _EQUAL)
-    numbers = sorted({one["first_seed"] + seed for one in chosen for seed in range(one["seeds"])})
-    if numbers != list(range(numbers[0], numbers[-1] + 1)):
-        missing = next(seed for seed in range(numbers[0], numbers[-1]) if seed not in numbers)
+    opened = [open_map(one) if isinstance(one, path) else one for one in maps]
+    chosen = [from_attrs(one) for one in opened]
+    compared = [
+        identity(settings) | {name: data.attrs.get(name) for name in _EQUAL}
+        for settings, data in zip(chosen, opened, strict=True)
+    ]
+    for name, values in zip(names, compared, strict=True):
+        if difference := first_difference(compared[0], values, but=_OF_PARTS):
+            key, *both = difference
+            first, other = map(short_repr, both)
+            raise InputError(
+                f"maps must have the same settings, and {key} is {first} in {names[0]} and {other} "
+                f"in {name}."
+            )
+    seeds = {one["first_seed"] + seed for one in chosen for seed in range(one["seeds"])}
+    if missing := {*range(min(seeds), max(seeds))} - seeds:
         raise InputError(
-            f"the seeds of the maps must follow one another, and seed {missing} is missing."
+            f"the seeds of the maps must follow one another, and seed {min(missing)} is missing."
         )
-    if (
-        chosen[0].get("error") is not None
-        and len({one["seeds"] for one in chosen} | {len(numbers)}) > 1
-    ):
+    if "error" in chosen[0] and {one["seeds"] for one in chosen} != {len(seeds)}:
         raise InputError(
             "maps with an `error` sample by their number of seeds, so they cannot be merged with "
             "other seeds."
         )
-    merged: dict[str, Any] = {
-        **chosen[0],
-        "first_seed": numbers[0],
-        "seeds": len(numbers),
-        "observe": observe,
-    }
-    own = chosen[0]["solver"]  # of a user's class: its text
-    text = own if isinstance(own, str) else solver_text(own)
-    if (solver is not None or own is text) and (solver is None or solver_text(solver) != text):
+    method: Any = chosen[0]["solver"] if solver is None else solver
+    text = compared[0]["solver"]
+    if isinstance(method, str) or solver_text(method) != text:  # a text is that of a user's class
         raise InputError(f"solver must be that of the maps, which is {text}.")
-    merged["solver"] = own if solver is None else solver
+    merged = {"first_seed": min(seeds), "seeds": len(seeds), "part": None}
     with jax.enable_x64(opened[0].attrs["precision"] == "float64"):
-        settings = MapSettings(**{name: value for name, value in merged.items() if name != "part"})
+        settings = MapSettings(**{**chosen[0], **merged, "observe": observe, "solver": method})
         return _joined(names, chosen, opened, settings)
 
 
 def _joined(
     names: list[str],
     chosen: list[dict[str, Any]],
-    opened: "Sequence[xr.DataTree]",
-    settings: "MapSettings",
-) -> "xr.DataTree":
+    opened: Sequence[xr.DataTree],
+    settings: MapSettings,
+) -> xr.DataTree:
     """The map of all replicas."""
-    from jaxgran.maps.dataset import map_dataset
-    from jaxgran.maps.own_observables import identity_of
-    from jaxgran.maps.sums import replicas_of
-
     if identity_of(settings) != chosen[0].get("observe"):
         raise InputError(
             f"observe must be the function of the maps, which is {chosen[0].get('observe')}."
@@ -141,18 +129,7 @@ def _joined(
     return map_dataset(settings, replicas, _attributes(opened))
 
 
-def _require_same(
-    first: str, here: Any, name: str, there: Any, keys: Sequence[str], but: Sequence[str] = ()
-) -> None:
-    for key in keys:
-        if key not in but and here.get(key) != there.get(key):
-            values = (
-                f"{short_repr(here.get(key))} in {first} and {short_repr(there.get(key))} in {name}"
-            )
-            raise InputError(f"maps must have the same settings, and {key} is {values}.")
-
-
-def _attributes(maps: "Sequence[xr.DataTree]") -> dict[str, Any]:
+def _attributes(maps: Sequence[xr.DataTree]) -> dict[str, Any]:
     """Attributes of the runs: times add up, and what differs is listed."""
     left_out = {
         *_OF_PARTS,

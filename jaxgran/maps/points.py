@@ -9,7 +9,8 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.settings import MapSettings, stack_of_any_size
+from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.settings_checks import stack_of_any_size
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import GIVEN_UP

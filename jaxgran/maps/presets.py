@@ -1,5 +1,5 @@
-"""The parameters of a map: those of a preset or of a file, replaced by those that are given and
-what they imply.
+"""What a map starts from: a preset or a file, replaced by the parameters that are given and by what
+these imply.
 
 This module loads neither JAX nor xarray at once, as the help of the command line needs the names of
 the presets.
@@ -38,6 +38,16 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
+_REPLACED = {
+    "error": ("seeds", "strain"),
+    "strain": ("error",),
+    "polydispersity": ("diameters",),
+    "diameters": ("polydispersity",),
+}
+_OF_POINTS = {"grains", "timestep", "restitution", "packing_fraction", "error"}
+_OF_ERROR = {"grains": "auto", "timestep": "auto", "seeds": 1}
+"""What an error implies; a longer sample is cheaper than a second seed."""
+
 
 def with_start(given: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters of ``ratio_map``: those given, on top of those of a preset or of a file.
@@ -47,9 +57,8 @@ def with_start(given: Mapping[str, Any]) -> dict[str, Any]:
     """
     preset, from_map = given.get("preset", "quick"), given.get("from_map")
     if not isinstance(preset, str) or preset not in PRESETS:
-        raise refused(
-            "preset", preset, f"must be {', '.join(list(PRESETS)[:-1])} or {list(PRESETS)[-1]}"
-        )
+        *others, last = PRESETS
+        raise refused("preset", preset, f"must be {', '.join(others)} or {last}")
     if from_map is None:
         return combined(PRESETS[preset], given)
     if "preset" in given:
@@ -63,49 +72,26 @@ def combined(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, An
     """The parameters of a preset or a file, replaced by those that are given and by what these
     imply.
     """
-    replaced = {
-        "error": ("seeds", "strain"),
-        "strain": ("error",),
-        "polydispersity": ("diameters",),
-        "diameters": ("polydispersity",),
-    }
-    left_out = {
-        name
-        for option, names in replaced.items()
-        if given.get(option) is not None
-        for name in names
-    }
-    kept = {name: value for name, value in start.items() if name not in left_out}
-    if "grains_by_point" in kept and given.keys() & {
-        "grains",
-        "timestep",
-        "restitution",
-        "packing_fraction",
-        "error",
-    }:
+    named = {name for name, value in given.items() if value is not None}
+    replaced = {name for option in _REPLACED.keys() & named for name in _REPLACED[option]}
+    kept = {name: value for name, value in start.items() if name not in replaced}
+    if "grains_by_point" in kept and _OF_POINTS & given.keys():
         del kept["grains_by_point"]
         kept["grains"] = "auto"  # chosen again, for the points that are given
-    return kept | for_error(given) | dict(given)
-
-
-def for_error(given: Mapping[str, Any]) -> dict[str, Any]:
-    """What a requested error implies unless it is given; a longer sample is cheaper than a second
-    seed.
-    """
-    automatic = {"grains": "auto", "timestep": "auto", "seeds": 1}
-    return automatic if given.get("error") is not None else {}
+    implied = _OF_ERROR if "error" in named else {}
+    return kept | implied | dict(given)
 
 
 def _parameters_of(file: Path) -> dict[str, Any]:
     """The parameters of the map in a file; a warning names other differences that could change its
     numbers.
     """
-    from jaxgran.maps.results import choices_of, differences, open_map
+    from jaxgran.maps.attributes import from_attrs
+    from jaxgran.maps.results import differences, open_map
 
     data = open_map(file)
-    chosen, different = choices_of(data), differences(data)
+    settings, different = from_attrs(data), differences(data)
     if different:
         warnings.warn(f"differs from {file}: {'; '.join(different)}.", stacklevel=4)
-    return chosen | {
-        "tolerance": getattr(chosen["solver"], "tolerance", None)
-    }  # also of another solver
+    # the tolerance holds for another solver too
+    return settings | {"tolerance": getattr(settings["solver"], "tolerance", None)}

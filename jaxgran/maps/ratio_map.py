@@ -4,35 +4,38 @@ dataset and a file.
 
 import inspect
 import os
-import sys
 import warnings
-from contextlib import closing, suppress
-from pathlib import Path
-from threading import Thread
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import fields, replace
+from functools import wraps
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
+import xarray as xr
 
-from jaxgran.dynamics.advance import register_numba
-from jaxgran.dynamics.engine import Numba, in_lockstep, select_engine
+from jaxgran.contact.projected_methods import ProjectedMethod
+from jaxgran.dynamics.engine import Engine, in_lockstep
 from jaxgran.environment import usable_cores
-from jaxgran.io.atomic import require_place
-from jaxgran.maps.batches import points_of_part
+from jaxgran.maps.automatic import chosen_settings
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import Provenance
+from jaxgran.maps.dataset import map_dataset, run_attributes
 from jaxgran.maps.interruption import Interrupted, is_interruption
-from jaxgran.maps.parameters import RunParameters, takes
 from jaxgran.maps.presets import with_start
+from jaxgran.maps.progress import progress
 from jaxgran.maps.replica import Advance, Key, Replica
 from jaxgran.maps.run_replicas import run_replicas
-from jaxgran.maps.settings import MapSettings, chosen_settings
-from jaxgran.model.checks import InputError, refused, require_flag, require_whole, short_repr
+from jaxgran.maps.settings import OPTIONS, MapSettings, RunOptions, table
+from jaxgran.maps.settings_checks import require_engine
+from jaxgran.maps.status_report import BadPoints, bad_points, format, format_short
+from jaxgran.maps.store import Store, open_store, replica_count
+from jaxgran.model.checks import refused
+from jaxgran.model.choices import Activation
 
-if TYPE_CHECKING:
-    import xarray as xr
-
-_MOST_WORKERS = 1024
+P = ParamSpec("P")
+R = TypeVar("R")
 _OF_RUN = (
     *("engine", "solver", "history", "part_points", "automatic_choice", "resumed_replicas"),
     *("wall_time_seconds", "replica_steps_per_second"),
@@ -40,8 +43,53 @@ _OF_RUN = (
 """Attributes of a map that are no parameters and not those of ``run_attributes``."""
 
 
-@takes(RunParameters)
-def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
+def fill_from_start(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator: what is not given comes from the preset or the file that a map starts from."""
+    signature = inspect.signature(function)
+
+    @wraps(function)
+    def started(*args: P.args, **kwargs: P.kwargs) -> R:
+        given = signature.bind(*args, **kwargs).arguments
+        return function(**with_start(given))  # type: ignore[call-arg]
+
+    if function.__doc__:  # none under python -OO
+        started.__doc__ = function.__doc__.replace("{PARAMETERS}", table())
+    return started
+
+
+@fill_from_start
+def ratio_map(
+    restitution: float | Sequence[float] | None = None,
+    packing_fraction: float | Sequence[float] | None = None,
+    *,
+    grains: int | Sequence[int] | Literal["auto"] = 256,
+    seeds: int = 2,
+    timestep: float | Sequence[float] | Literal["auto"] = 1e-3,
+    equilibrate: float | None = None,
+    strain: float | None = None,
+    error: float | None = None,
+    tolerance: float | None = None,
+    solver: ProjectedMethod | None = None,
+    activation: Activation = "midpoint",
+    engine: Engine | None = None,
+    grains_by_point: Sequence[int] | None = None,
+    snapshots: bool = False,
+    first_seed: int = 0,
+    observe: Callable[..., Any] | None = None,
+    polydispersity: float = 0.26,
+    diameters: Sequence[float] | None = None,
+    part: str | None = None,
+    preset: str = "quick",
+    from_map: str | os.PathLike | None = None,
+    output: str | os.PathLike | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: bool | Callable[[float], object] = False,
+    record: Callable[..., Any] | None = None,
+    attributes: dict[str, Any] | None = None,
+) -> xr.DataTree:
     """Force ratio, stresses and temperature over a grid of restitutions and packing fractions, with
     errors.
 
@@ -75,146 +123,55 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
       >>> data.force_ratio.dims
       ('packing_fraction', 'restitution')
     """
-    given = inspect.signature(RunParameters).bind(*arguments, **parameters).arguments
-    run = RunParameters(**with_start(given))
-    output = _checked(run)
-    settings, automatic_choice = chosen_settings(run)
-    settings.require_engine()
-    _require_own_attributes(run, settings)
-    workers = _workers(run)
-    if automatic_choice:
-        _tell(run, f"chosen: {automatic_choice}")
-    earlier, difference, finished = (
-        (None, "", False) if output is None else _earlier(output, settings)
-    )
-    if difference and not run.overwrite:
-        raise InputError(
-            f"output {short_repr(str(output))} already exists and has {difference}; "
-            "pass `overwrite=True` to replace it.",
-            field="output",
-        )
-    checkpoint, complete = (
-        None if output is None else Checkpoint(output, settings, run.resume),
-        False,
-    )
-    try:
-        if checkpoint is not None and run.resume:
-            started = checkpoint.done or checkpoint.journals()
-            if earlier is not None and finished and not difference and not started:
-                complete = True
-                _tell(run, f"{output} is finished and is read from its file.")
-                return earlier
-            _tell_resumed(run, settings, checkpoint)
-        results, attributes, interruption = _run(
-            run, settings, workers, None if run.record else checkpoint
-        )
-        from jaxgran.maps.dataset import map_dataset  # here: xarray is loaded while the flows run
-        from jaxgran.maps.results import write_dataset
-
-        attributes |= {"automatic_choice": automatic_choice, **(run.attributes or {})}
-        data = map_dataset(settings, results, attributes)
-        if output is not None and any(results.values()) and not (interruption and finished):
-            write_dataset(data, output)
-        if interruption is not None:
-            raise Interrupted(data) from interruption
-        complete = sum(replica is not None for replica in results.values()) == _count(settings)
-    except OSError as error:
-        if checkpoint is not None and checkpoint.done:
-            error.add_note(
-                f"finished batches are in {checkpoint.folder}: make room and add `resume=True`"
-            )
-        raise
-    finally:
-        if checkpoint is not None:
-            checkpoint.close(complete)
+    settings, run = settle(locals())  # all parameters by name
+    with open_store(settings, run) as store:
+        if store.result is not None:
+            run.tell(f"{store.output} is finished and is read from its file.")
+            return store.result
+        measured = run_missing(settings, run, store)
+        data = map_dataset(settings, measured.replicas, measured.attributes)
+        store.write(data, interrupted=measured.interruption is not None)
+        if measured.interruption is not None:
+            raise Interrupted(data) from measured.interruption
     _warn_of_bad_points(data)
     return data
 
 
-def _checked(run: RunParameters) -> Path | None:
-    """The output of a map; InputError if something cannot be accepted about how the map is run and
-    kept.
+class Measured(NamedTuple):
+    """The replicas of a map, the attributes of their run, and what interrupted it, or None."""
+
+    replicas: dict[Key, Replica | None]
+    attributes: dict[str, Any]
+    interruption: BaseException | None
+
+
+def settle(parameters: Mapping[str, Any]) -> tuple[MapSettings, RunOptions]:
+    """The settings of a map, with numbers for "auto", and how it is run, with the number of
+    workers.
+
+    Raises:
+      InputError: (a ValueError) something cannot be accepted.
     """
-    for name in ("overwrite", "resume"):
-        require_flag(name, getattr(run, name))
-    if run.workers is not None:
-        require_whole("workers", run.workers, 1, _MOST_WORKERS)
-    if not isinstance(run.progress, bool) and not callable(run.progress):
-        raise refused("progress", run.progress, "must be True, False or a function of one number")
-    if run.scheduler is not None and not isinstance(run.scheduler, str):
-        raise refused("scheduler", run.scheduler, "must be an address")
-    several = run.workers is not None and run.workers > 1
-    if run.scheduler is not None and several:
-        raise InputError("`scheduler` and `workers` exclude each other.", field="scheduler")
-    if run.strain is not None and run.error is not None:
-        raise InputError("`strain` and `error` exclude each other.", field="strain")
-    if run.record is not None and not callable(run.record):
-        raise refused("record", run.record, "must be a function")
-    if run.record is not None and (run.resume or several or run.scheduler is not None):
-        raise InputError("`record` requires one worker, and excludes `resume`.", field="record")
-    if run.attributes is not None and not isinstance(run.attributes, dict):
-        raise refused("attributes", run.attributes, "must be a dictionary")
-    if run.output is None:
-        if run.resume:
-            raise InputError("`resume` requires `output`.", field="resume")
-        return None
-    if not isinstance(run.output, (str, os.PathLike)):
-        raise refused("output", run.output, "must be a file name")
-    output = Path(run.output)
-    require_place(output, "output", ".nc")
-    return output
+    run = RunOptions(**{row.name: parameters[row.name] for row in fields(RunOptions)})
+    settings, automatic_choice = chosen_settings(parameters)
+    require_engine(settings)
+    _require_own_attributes(run, settings)
+    attributes = {"automatic_choice": automatic_choice, **(run.attributes or {})}
+    run = replace(run, workers=_workers(run), attributes=attributes)
+    if automatic_choice:
+        run.tell(f"chosen: {automatic_choice}")
+    return settings, run
 
 
-def _require_own_attributes(run: RunParameters, settings: MapSettings) -> None:
-    """Raise an InputError if the user's attributes have a name of the map's; only the command may
-    be given.
-    """
-    if not set(run.attributes or {}) - {"command"}:
-        return
-    from jaxgran.maps.dataset import run_attributes
-
-    names = {*inspect.signature(RunParameters).parameters, *run_attributes(settings), *_OF_RUN}
-    for name in set(run.attributes or {}) & names:
-        raise refused("attributes", name, "must have names that a map does not have")
-
-
-def _workers(run: RunParameters) -> int:
-    """How many batches run at a time; InputError if they cannot."""
-    on_cpu = not in_lockstep()
-    if run.workers is None:
-        return usable_cores() if on_cpu and run.scheduler is None and run.record is None else 1
-    if run.workers > 1 and not on_cpu:
-        raise refused("workers", run.workers, "must be 1 on an accelerator")
-    return run.workers
-
-
-def _earlier(output: Path, settings: MapSettings) -> tuple[Any, str, bool]:
-    """The map that the output has already, how it differs from one of these settings, and whether
-    it is finished.
-    """
-    if not output.exists():
-        return None, "", False
-    from jaxgran.maps.results import (
-        earlier_map,
-        is_finished,
-    )  # here, or every map would begin by loading xarray
-
-    data, difference = earlier_map(output, settings)
-    return data, difference, data is not None and is_finished(data)
-
-
-def _run(
-    run: RunParameters, settings: MapSettings, workers: int, checkpoint: Checkpoint | None
-) -> tuple[dict[Key, Replica | None], dict[str, Any], BaseException | None]:
-    """Run what the checkpoint lacks; the results, attributes of the run, and the interruption that
-    ended it.
-    """
-    from jaxgran.maps.progress import progress  # here: a worker of a cluster need not load Rich
-
-    Thread(target=_load_meanwhile, args=(settings,), name="jaxgran-load").start()
-    workers, start = min(_count(settings), workers), perf_counter()
+def run_missing(settings: MapSettings, run: RunOptions, store: Store) -> Measured:
+    """Run the replicas that the checkpoint lacks."""
+    checkpoint = None if run.record else store.checkpoint
+    if checkpoint is not None and run.resume:
+        _tell_resumed(settings, run, checkpoint)
+    workers, start = min(replica_count(settings), run.workers or 1), perf_counter()
     results: dict[Key, Replica | None] = {} if checkpoint is None else dict(checkpoint.done)
     attributes: dict[str, Any] = {"workers": workers, "resumed_replicas": len(results)}
+    made: Provenance = {}
     interruption = None
     with progress(settings, quiet=run.progress is not True) as meter:
         meter.resumed(results)
@@ -224,7 +181,6 @@ def _run(
             if callable(run.progress):
                 run.progress(float(np.sum(advance.steps)))
 
-        made: Provenance = {}
         running = run_replicas(
             settings, workers, report, checkpoint, run.scheduler, run.record, made
         )
@@ -243,53 +199,47 @@ def _run(
         "wall_time_seconds": seconds,
         "replica_steps_per_second": meter.done_steps / seconds,
     }
-    return results, attributes, interruption
+    return Measured(results, attributes | (run.attributes or {}), interruption)
 
 
-def _load_meanwhile(settings: MapSettings) -> None:
-    """Load what is needed later while the flows run; errors come back where it is used."""
-    with suppress(Exception):
-        if isinstance(select_engine(settings.flows()[0], settings.numerics), Numba):
-            register_numba()
-        import xarray
-
-        import jaxgran.maps.dataset
-        import jaxgran.maps.results  # noqa: F401
-
-        xarray.Dataset({"numbers": ("numbers", [0.0])})  # the first dataset loads as much again
+def _require_own_attributes(run: RunOptions, settings: MapSettings) -> None:
+    """Raise an InputError if the user's attributes have a name of the map's; only the command may
+    be given.
+    """
+    own = set(run.attributes or {}) - {"command"}
+    if not own:
+        return
+    for name in own & {*OPTIONS, *run_attributes(settings), *_OF_RUN}:
+        raise refused("attributes", name, "must have names that a map does not have")
 
 
-def _count(settings: MapSettings) -> int:
-    """Number of replicas."""
-    return len(points_of_part(settings)) * settings.seeds
+def _workers(run: RunOptions) -> int:
+    """How many batches run at a time; InputError if they cannot."""
+    on_cpu = not in_lockstep()
+    if run.workers is None:
+        return usable_cores() if on_cpu and run.scheduler is None and run.record is None else 1
+    if run.workers > 1 and not on_cpu:
+        raise refused("workers", run.workers, "must be 1 on an accelerator")
+    return run.workers
 
 
-def _tell(run: RunParameters, sentence: str) -> None:
-    """Print a sentence on standard error where progress is shown."""
-    if run.progress is True:
-        print(sentence, file=sys.stderr)
-
-
-def _tell_resumed(run: RunParameters, settings: MapSettings, checkpoint: Checkpoint) -> None:
+def _tell_resumed(settings: MapSettings, run: RunOptions, checkpoint: Checkpoint) -> None:
     """Print how much of a map is done, and which files are damaged."""
     under_way = len(checkpoint.journals())
-    _tell(
-        run,
-        f"continued: {len(checkpoint.done)} of {_count(settings)} replicas are done, {under_way} "
-        "batches under way.",
+    run.tell(
+        f"continued: {len(checkpoint.done)} of {replica_count(settings)} replicas are done, "
+        f"{under_way} batches under way."
     )
     if checkpoint.damaged:
-        _tell(run, f"damaged and computed again: {', '.join(checkpoint.damaged)}.")
+        run.tell(f"damaged and computed again: {', '.join(checkpoint.damaged)}.")
 
 
-def _warn_of_bad_points(data: "xr.DataTree") -> None:
+def _warn_of_bad_points(data: xr.DataTree) -> None:
     """Warn of points with a bad status and of short samples."""
-    from jaxgran.maps.status_report import BadPoints, bad_points, format, format_short
-
     bad = bad_points(data)
     bad.pop("failed", None)  # batches that were given up have had a warning of their own
     short = bad.pop("short_sample", [])
     if short:
-        warnings.warn(format_short(data, short), BadPoints, stacklevel=3)
+        warnings.warn(format_short(data, short), BadPoints, stacklevel=4)
     if bad:
-        warnings.warn(format(data, bad), BadPoints, stacklevel=3)
+        warnings.warn(format(data, bad), BadPoints, stacklevel=4)

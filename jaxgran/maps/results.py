@@ -1,4 +1,4 @@
-"""Write, read and compare the file of a map.
+"""Write and read the file of a map.
 
 A file ends in a SHA-256 checksum of its content, which other readers of NetCDF ignore. It is
 compared first, because the HDF5 library may never return from a damaged file. Files written by
@@ -6,11 +6,8 @@ other programs have no checksum.
 """
 
 import hashlib
-import json
 import os
-from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -19,11 +16,7 @@ from jaxgran.files import atomic_write, other_version
 from jaxgran.maps.schema import FORMAT_VERSION, RATIO, what_lacks
 from jaxgran.model.checks import InputError, refused, short_repr
 
-if TYPE_CHECKING:
-    from jaxgran.maps.settings import MapSettings
-
 _MARK = b"SHA-256:"  # between the dataset and its checksum
-_SINCE = ("polydispersity",)  # parameters that older maps do not name; they had the default
 _DIGEST = hashlib.sha256().digest_size  # bytes
 
 
@@ -77,90 +70,6 @@ def _whole(path: Path) -> bytes:
     if end.startswith(_MARK) and end.removeprefix(_MARK) != hashlib.sha256(content).digest():
         raise ValueError("it is damaged, and not what was written")
     return whole
-
-
-def choices_of(data: xr.DataTree) -> dict[str, Any]:
-    """The parameters of a map, as arguments of ``MapSettings``; InputError if one is missing.
-
-    Engine and solver are those that were requested, not those that ran. The solver of a user's own
-    class is given by its name and numbers, and what a user observes by names and a hash, as class
-    and function are not in the file.
-    """
-    from jaxgran.dynamics.engine import (
-        engine_named,
-    )  # here, so that figures are drawn without loading JAX
-    from jaxgran.maps.settings import MapSettings
-
-    chosen: dict[str, Any] = {}
-    try:
-        for field in fields(MapSettings):
-            if field.name in ("solver", "engine", "tolerance"):
-                continue
-            attribute = next(
-                (name for name in (f"{field.name}_requested", field.name) if name in data.attrs),
-                None,
-            )
-            if field.name in data.coords:  # one number where one of a list was selected
-                values = data.coords[field.name].values.tolist()
-                chosen[field.name] = tuple(values) if isinstance(values, list) else values
-            elif attribute is not None:
-                chosen[field.name] = np.asarray(data.attrs[attribute]).tolist()
-            elif field.default is not None and field.name not in _SINCE:
-                raise KeyError(field.name)
-        chosen["equilibrate"] = (
-            None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
-        )
-        chosen["snapshots"] = bool(chosen["snapshots"])
-        chosen |= {
-            "solver": _solver_of(data),
-            "engine": engine_named(data.attrs["engine_requested"]),
-        }
-        return chosen | {
-            name: tuple(np.atleast_1d(chosen[name]).tolist())
-            for name in ("restitution", "packing_fraction", "grains_by_point", "diameters")
-            if name in chosen
-        }
-    except KeyError as missing:
-        raise InputError(f"these data do not contain the {missing.args[0]} of their map.") from None
-
-
-def _solver_of(data: xr.DataTree) -> Any:
-    """The solver that was asked for; name and numbers where its class is not of this package."""
-    from jaxgran.contact.projected_methods import SOLVERS
-
-    name, numbers = str(data.attrs["solver_requested"]), str(data.attrs["solver_parameters"])
-    try:
-        return SOLVERS[name](**json.loads(numbers)) if name in SOLVERS else f"{name} {numbers}"
-    except (TypeError, json.JSONDecodeError):
-        raise InputError(
-            f"solver_parameters must be those of {name}, not {short_repr(numbers)}."
-        ) from None
-
-
-def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.DataTree | None, str]:
-    """The map that is in a file already, or None, and a description of what a map of these settings
-    would replace.
-
-    The description is "" if the file holds a map of the same settings.
-    """
-    from jaxgran.contact.projected_methods import solver_text
-    from jaxgran.maps.own_observables import identity_of
-
-    try:
-        data = open_map(path)
-        chosen = choices_of(data)
-    except InputError:
-        return None, "something other than a map of this version"
-    for field in fields(settings):
-        there: Any = chosen.get(field.name, field.default)
-        here: Any = (
-            identity_of(settings) if field.name == "observe" else getattr(settings, field.name)
-        )
-        if isinstance(there, str) and field.name == "solver":
-            here = solver_text(here)
-        if there != here:
-            return data, f"a map with {field.name} {short_repr(there)} and not {short_repr(here)}"
-    return data, ""
 
 
 def is_finished(data: xr.DataTree) -> bool:

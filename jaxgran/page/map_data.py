@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from jaxgran.maps.parameters import default, options
 from jaxgran.maps.schema import FINEST, TENSOR_AXES, MapData, path_of, require_map
+from jaxgran.maps.settings import DEFAULTS, options
 from jaxgran.model.checks import InputError
 from jaxgran.model.display import unit_text
 from jaxgran.model.status import MEANINGS
@@ -297,7 +297,7 @@ def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
     try:
         chosen["tolerance"] = f"{float(data.attrs['tolerance']):g}"
         sizes = "diameters" if "diameters" in data.attrs else "polydispersity"
-        if sizes in data.attrs and not np.array_equal(data.attrs[sizes], default(sizes)):
+        if sizes in data.attrs and not np.array_equal(data.attrs[sizes], DEFAULTS[sizes]):
             chosen[sizes] = ",".join(repr(float(x)) for x in np.ravel(data.attrs[sizes]))
         seeds = int(data.attrs["seeds"])
     except (TypeError, ValueError):

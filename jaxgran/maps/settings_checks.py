@@ -1,0 +1,209 @@
+"""What is accepted as the settings of a map, and as the options of its run."""
+
+import math
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, require_solver
+from jaxgran.dynamics.batch import stack
+from jaxgran.dynamics.engine import checked_numerics, select_engine
+from jaxgran.io.atomic import require_place
+from jaxgran.maps.own_observables import require_observe
+from jaxgran.maps.settings import DEFAULTS, OPTIONS, MapSettings, RunOptions, new_flows
+from jaxgran.model.checks import (
+    InputError,
+    refused,
+    require_flag,
+    require_number,
+    require_whole,
+    two_digits,
+)
+from jaxgran.model.choices import MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.grains import own_grains
+from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
+from jaxgran.sampling.packing import require_room
+from jaxgran.sampling.prediction import predicted
+from jaxgran.sampling.timestep import expected_temperature, longest_timestep
+
+FEWEST_STEPS = 160  # of a sample: five time steps in each of its 32 blocks
+_LARGEST_SEED = 2**30
+_MOST_WORKERS = 1024
+
+
+def with_tolerance(solver: Any, tolerance: Any) -> Any:
+    """The solver with a given tolerance, or its own without one."""
+    solver = DEFAULT_SOLVER if solver is None else solver
+    require_solver(solver)
+    return solver if tolerance is None else replace(solver, tolerance=tolerance)
+
+
+def check_axes(settings: MapSettings) -> None:
+    """Raise an InputError unless the axes are lists of different numbers, and grains by point are
+    given for all points, and not as a list too.
+    """
+    for name, values in settings.axes.items():
+        if not isinstance(values, tuple) or len(values) > MAX_REPLICAS:
+            raise refused(name, values, f"must be a list of at most {MAX_REPLICAS} numbers")
+        if len(values) == 0:
+            raise refused(name, [], "must be a list of at least one number")
+        if not are_numbers(values):
+            raise refused(name, values, "must be a list of numbers")
+        if len(set(values)) < len(values):
+            raise refused(name, list(values), "must be a list without repetition, in any order")
+    by_point = settings.grains_by_point
+    if by_point is None:
+        return
+    points = len(settings.timesteps) * len(settings.packing_fraction) * len(settings.restitution)
+    listed = isinstance(by_point, tuple) and len(by_point) == points and are_numbers(by_point)
+    if not listed or "grains" in settings.axes:
+        reason = f"must be a list of {points} numbers, one for each point"
+        raise refused("grains_by_point", by_point, reason)
+
+
+def check_settings(settings: MapSettings) -> None:
+    """Raise an InputError unless a map of these settings can be run."""
+    checked_numerics(settings.solver, settings.engine)
+    require_whole("seeds", settings.seeds, 1, MAX_REPLICAS, "the most replicas of a map")
+    because = "to fit into 32 bits with all that follow"
+    require_whole("first_seed", settings.first_seed, 0, _LARGEST_SEED, because)
+    require_flag("snapshots", settings.snapshots)
+    points = math.prod(map(len, settings.axes.values()))
+    if points * settings.seeds > MAX_REPLICAS:
+        raise InputError(
+            f"a map must have at most {MAX_REPLICAS} replicas, points times seeds, "
+            f"not {points * settings.seeds}.",
+            field="seeds",
+        )
+    for row in fields(MapSettings):
+        value, accepted = getattr(settings, row.name), OPTIONS[row.name].range
+        if accepted is not None and value is not None and row.name not in settings.axes:
+            require_number(row.name, value, *accepted)
+    flows = new_flows(settings)
+    _check_diameters(settings, flows)
+    _check_part(settings, points)
+    if settings.observe is not None:
+        require_observe(settings.observe, flows[0])
+    _check_timesteps(settings, stack_of_any_size(flows))
+
+
+def _check_diameters(settings: MapSettings, flows: Sequence[ShearFlow]) -> None:
+    if settings.diameters is None:
+        return
+    own_grains(settings.diameters)  # type: ignore[arg-type]
+    if settings.polydispersity != DEFAULTS["polydispersity"]:
+        reason = "must be left out where `diameters` are given"
+        raise refused("polydispersity", settings.polydispersity, reason)
+    if any(size % len(settings.diameters) for size in settings.sizes):
+        sizes = ", ".join(map(str, settings.sizes))
+        reason = f"must be a list whose length divides the number of grains, {sizes}"
+        raise refused("diameters", list(settings.diameters), reason)
+    densest = max(flows, key=lambda flow: float(flow.packing_fraction))
+    for size in settings.sizes:
+        discs = own_grains(np.resize(settings.diameters, size))
+        require_room(replace(densest, grains=size), discs)
+
+
+def _check_part(settings: MapSettings, points: int) -> None:
+    if settings.part is None:
+        return
+    text = settings.part if isinstance(settings.part, str) else ""
+    share = re.fullmatch(r"([1-9]\d{0,5})/([1-9]\d{0,5})", text)
+    if share is None or not int(share[1]) <= int(share[2]) <= points:
+        reason = f"must be K/N with K at most N, and N at most {points}, the number of points"
+        raise refused("part", settings.part, reason)
+
+
+def _check_timesteps(settings: MapSettings, flows: ShearFlow) -> None:
+    """Raise an InputError if a time step does not fit to the flows or to the sampled strain."""
+    shortest, longest = min(settings.timesteps), max(settings.timesteps)
+    if shortest < SHORTEST_TIMESTEP:
+        reason = f"must be at least {SHORTEST_TIMESTEP:g} / shear rate"
+        raise refused("timestep", shortest, reason)
+    strain = LEAST_SAMPLE if settings.strain is None else settings.strain
+    if strain > MAX_STEPS * shortest:
+        most = f"{MAX_STEPS} time steps, that is {MAX_STEPS * shortest:g}"
+        raise refused("strain", strain, f"must be at most {most}")
+    temperature = temperature_of(settings, flows)
+    limits = longest_timestep(temperature, flows.packing_fraction, settings.activation)
+    excess = np.asarray(flows.timestep) / limits
+    worst = int(np.argmax(excess))
+    if excess[worst] > 1:
+        most = two_digits(limits[worst], up=False)
+        reason = f"must be at most {most} at {point_text(flows, worst)} to avoid deep overlaps"
+        raise refused("timestep", float(np.asarray(flows.timestep)[worst]), f"{reason}, or auto")
+    if round(strain / longest) < FEWEST_STEPS:
+        least = f"{FEWEST_STEPS} time steps, that is {FEWEST_STEPS * longest:g}"
+        raise refused("strain", strain, f"must be at least {least}")
+
+
+def require_engine(settings: MapSettings) -> None:
+    """Raise an InputError if the engine that is asked for cannot run this map here."""
+    if settings.engine is not None:
+        option = "" if settings.observe is None else "observe"
+        select_engine(settings.flows()[0], settings.numerics, option=option)
+
+
+def check_run(run: RunOptions) -> None:
+    """Raise an InputError unless a map can be run and kept with these options."""
+    require_flag("overwrite", run.overwrite)
+    require_flag("resume", run.resume)
+    if run.workers is not None:
+        require_whole("workers", run.workers, 1, _MOST_WORKERS)
+    if not isinstance(run.progress, bool) and not callable(run.progress):
+        raise refused("progress", run.progress, "must be True, False or a function of one number")
+    if run.scheduler is not None and not isinstance(run.scheduler, str):
+        raise refused("scheduler", run.scheduler, "must be an address")
+    several = run.workers is not None and run.workers > 1
+    if run.scheduler is not None and several:
+        raise InputError("`scheduler` and `workers` exclude each other.", field="scheduler")
+    if run.record is not None and not callable(run.record):
+        raise refused("record", run.record, "must be a function")
+    if run.record is not None and (run.resume or several or run.scheduler is not None):
+        raise InputError("`record` requires one worker, and excludes `resume`.", field="record")
+    if run.attributes is not None and not isinstance(run.attributes, dict):
+        raise refused("attributes", run.attributes, "must be a dictionary")
+    if run.output is None:
+        if run.resume:
+            raise InputError("`resume` requires `output`.", field="resume")
+        return
+    if not isinstance(run.output, (str, os.PathLike)):
+        raise refused("output", run.output, "must be a file name")
+    require_place(Path(run.output), "output", ".nc")
+
+
+def are_numbers(values: Sequence[Any]) -> bool:
+    """Whether all values are single real numbers."""
+    return all(
+        isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool)
+        for x in values
+    )
+
+
+def stack_of_any_size(flows: Sequence[ShearFlow]) -> ShearFlow:
+    """The flows as one batch at their largest number of grains, for what does not depend on this
+    number.
+    """
+    largest = max(flow.grains for flow in flows)
+    return stack(
+        [flow if flow.grains == largest else replace(flow, grains=largest) for flow in flows]
+    )
+
+
+def temperature_of(settings: MapSettings, flows: ShearFlow) -> np.ndarray:
+    """Expected granular temperature of each flow, in mσ²/t²."""
+    grains = settings.size_classes(np.size(flows.restitution))
+    theory = predicted(flows, grains).granular_temperature
+    return expected_temperature(theory, flows.packing_fraction, flows.shear_rate)
+
+
+def point_text(flows: ShearFlow, k: int) -> str:
+    """Restitution and packing fraction of flow ``k`` of a batch, for a message."""
+    alpha, nu = (float(np.asarray(x)[k]) for x in (flows.restitution, flows.packing_fraction))
+    return f"restitution {alpha:g} and packing fraction {nu:g}"
