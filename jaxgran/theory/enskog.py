@@ -17,7 +17,6 @@ from jaxgran.theory.steady_shear import Scalar, as_floats
 
 # Contact directions on the half circle; the integrand is smooth and periodic: errors below 1e-11
 _ANGLES = 32
-_einsum = partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
 
 
 class Collisions(NamedTuple):
@@ -97,34 +96,37 @@ def enskog_collisions(
     """
     masses, distances = mixture.masses, mixture.contact_diameters
     angle = (jnp.arange(_ANGLES, dtype=masses.dtype) + 0.5) * (jnp.pi / _ANGLES)
-    n = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     arc = 2 * jnp.pi / _ANGLES  # both halves of the circle contribute equally
+    # Sums, not products of matrices, whose last bits depend on the size of a batch
+    n = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    nn = n[:, None] * n[None, :]  # (2, 2, angles)
     tensors = jnp.broadcast_to(temperature.reshape(2, 2, -1), (2, 2, masses.size))
-    along = _einsum("abi,bk->aik", tensors, n)  # T·n
-    spread = _einsum("aik,ak,i->ik", along, n, 1 / masses)
+    along = jnp.sum(tensors[:, :, :, None] * n[None, :, None, :], axis=1)  # T·n
+    spread = jnp.sum(along * n[:, None, :], axis=0) / masses[:, None]
     first, second, third = _half_range_moments(
-        -rate * distances[:, :, None] * (n[0] * n[1])[None, None, :],
+        -rate * distances[:, :, None] * nn[0, 1][None, None, :],
         jnp.sqrt(spread[:, None, :] + spread[None, :, :]),
     )  # each (classes, classes, angles)
 
     impulse = (1 + alpha) * mixture.reduced_masses  # over the speed of approach
     encounters = arc * mixture.encounters
-    per_area = mixture.number_densities[:, None] * encounters / 2  # each pair is summed twice
-    stress, speed_stress = (
-        _einsum("ij,ijk,ak,bk->ab", per_area * impulse * distances, moment, n, n)
-        for moment in (second, third)
-    )
-    loss = _einsum("ij,ijk->ik", encounters * impulse, first)
-    gain = _einsum("ij,ijk->ik", encounters * impulse**2, third)
-    drag = _einsum("ik,aik,bk->abi", loss, along, n)
+    loss = jnp.sum((encounters * impulse)[:, :, None] * first, axis=1)
+    gain = jnp.sum((encounters * impulse**2)[:, :, None] * third, axis=1)
+    drag = jnp.sum((loss[None] * along)[:, None] * n[None, :, None, :], axis=-1)
     returned = (1 - 1 / length) * (1 - alpha) / (1 + alpha) * jnp.sum(gain, axis=1) / 2
     source = (
-        _einsum("ik,ak,bk->abi", gain, n, n)
+        jnp.sum(gain[None, None] * nn[:, :, None, :], axis=-1)
         - 2 * (drag + jnp.swapaxes(drag, 0, 1))
         + jnp.eye(2, dtype=masses.dtype)[:, :, None] * returned[None, None, :]
     )
-    energy = _einsum("ij,ijk->", per_area * impulse, third)
-    collisions = _einsum("ij,ijk->", per_area, first)
+    per_area = mixture.number_densities[:, None] * encounters / 2  # each pair is summed twice
+    transfer = (per_area * impulse * distances)[:, :, None]
+    stress, speed_stress = (
+        jnp.sum(nn * jnp.sum(transfer * moment, axis=(0, 1))[None, None], axis=-1)
+        for moment in (second, third)
+    )
+    energy = jnp.sum((per_area * impulse)[:, :, None] * third)
+    collisions = jnp.sum(per_area[:, :, None] * first)
     return Collisions(
         stress=stress,
         speed_stress=speed_stress,
