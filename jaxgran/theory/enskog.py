@@ -109,17 +109,16 @@ def enskog_collisions(
     )  # each (classes, classes, angles)
 
     impulse = (1 + alpha) * mixture.reduced_masses  # over the speed of approach
-    encounters = arc * mixture.encounters
-    loss = jnp.sum((encounters * impulse)[:, :, None] * first, axis=1)
-    gain = jnp.sum((encounters * impulse**2)[:, :, None] * third, axis=1)
-    drag = jnp.sum((loss[None] * along)[:, None] * n[None, :, None, :], axis=-1)
+    loss = arc * jnp.sum((mixture.encounters * impulse)[:, :, None] * first, axis=1)
+    gain = arc * jnp.sum((mixture.encounters * impulse**2)[:, :, None] * third, axis=1)
+    drag = along[:, None] * n[None, :, None, :] + n[:, None, None, :] * along[None, :]
     returned = (1 - 1 / length) * (1 - alpha) / (1 + alpha) * jnp.sum(gain, axis=1) / 2
     source = (
-        jnp.sum(gain[None, None] * nn[:, :, None, :], axis=-1)
-        - 2 * (drag + jnp.swapaxes(drag, 0, 1))
+        jnp.sum(gain[None, None] * nn[:, :, None, :] - 2 * loss[None, None] * drag, axis=-1)
         + jnp.eye(2, dtype=masses.dtype)[:, :, None] * returned[None, None, :]
     )
-    per_area = mixture.number_densities[:, None] * encounters / 2  # each pair is summed twice
+    # half: each pair is summed twice
+    per_area = mixture.number_densities[:, None] * mixture.encounters * arc / 2
     transfer = (per_area * impulse * distances)[:, :, None]
     stress, speed_stress = (
         jnp.sum(nn * jnp.sum(transfer * moment, axis=(0, 1))[None, None], axis=-1)

@@ -120,10 +120,11 @@ def steady_moments(
 
     tensors = _temperatures(solution)
     collisions = enskog_collisions(tensors, alpha, one, mixture, length)
-    kinetic = jnp.sum(mixture.number_densities[None, None, :] * tensors, axis=-1)
-    stress = kinetic + collisions.stress
+    densities = mixture.number_densities
+    kinetic = jnp.sum(densities * jnp.trace(tensors)) / 2
+    stress = jnp.sum(densities[None, None, :] * tensors, axis=-1) + collisions.stress
     return SteadyShear(
-        granular_temperature=jnp.trace(kinetic) / 2 / jnp.sum(mixture.number_densities) * rate**2,
+        granular_temperature=kinetic / jnp.sum(densities) * rate**2,
         pressure=jnp.trace(stress) / 2 * rate**2,
         shear_stress=-stress[0, 1] * rate**2,
         collision_rate=collisions.collision_rate,
