@@ -98,7 +98,7 @@ class MapSettings(MapParameters):
             most = f"{MAX_STEPS} time steps, that is {MAX_STEPS * shortest:g}"
             raise refused("strain", strain, f"must be at most {most}")
         limits = longest_timestep(
-            _temperature(self, flows), flows.packing_fraction, self.activation
+            _temperature(self, flows), flows.packing_fraction, flows.activation
         )
         excess = np.asarray(flows.timestep) / limits
         worst = int(np.argmax(excess))
@@ -310,7 +310,7 @@ def chosen_settings(asked: MapParameters) -> tuple[MapSettings, str]:
     if "timestep" in automatic:
         flows = stack_of_any_size(replace(checked, timestep=_SAFE["timestep"], strain=1.0).flows())
         steps = automatic_timestep(
-            _temperature(checked, flows), flows.packing_fraction, checked.activation, target
+            _temperature(checked, flows), flows.packing_fraction, flows.activation, target
         )
         if isinstance(chosen["strain"], int | float):
             steps = np.minimum(steps, chosen["strain"] / _FEWEST_STEPS)
