@@ -28,7 +28,7 @@ from jaxgran.model.choices import (
 )
 from jaxgran.model.display import text_of
 
-THETA = {"midpoint": 0.5, "touching": 0.0}  # of the activation rules
+_THETA = {"midpoint": 0.5, "touching": 0.0}  # of the activation rules
 
 RANGES = {
     "restitution": (lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
@@ -39,7 +39,7 @@ RANGES = {
     "timestep": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
     "shear_rate": (lambda x: (x >= 0) & np.isfinite(x), "a number of at least 0"),
     "polydispersity": (lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),
-    "activation": (lambda x: (x == 0.5) | (x == 0), " or ".join(THETA)),
+    "activation": (lambda x: (x == 0.5) | (x == 0), " or ".join(_THETA)),
 }
 
 
@@ -97,14 +97,14 @@ class ShearFlow(Indexable):
     def __repr__(self) -> str:
         values = {name: getattr(self, name) for name in self.__dataclass_fields__}
         if isinstance(self.activation, float):
-            rules = {theta: rule for rule, theta in THETA.items()}
+            rules = {theta: rule for rule, theta in _THETA.items()}
             values["activation"] = rules.get(self.activation, self.activation)
         return text_of("ShearFlow", values)
 
     def __post_init__(self):
         require_whole("grains", self.grains, MIN_GRAINS, MAX_GRAINS, "as memory is limited")
         if isinstance(self.activation, str):
-            object.__setattr__(self, "activation", THETA.get(self.activation, self.activation))
+            object.__setattr__(self, "activation", _THETA.get(self.activation, self.activation))
         for name, (accepts, words) in RANGES.items():
             object.__setattr__(self, name, as_array(getattr(self, name)))
             require(name, getattr(self, name), accepts, words)
