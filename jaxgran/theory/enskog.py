@@ -97,7 +97,7 @@ def enskog_collisions(
     masses, distances = mixture.masses, mixture.contact_diameters
     angle = (jnp.arange(_ANGLES, dtype=masses.dtype) + 0.5) * (jnp.pi / _ANGLES)
     arc = 2 * jnp.pi / _ANGLES  # both halves of the circle contribute equally
-    # Sums, not products of matrices, whose last bits depend on the size of a batch
+    # Sums, as accelerators round products of matrices more coarsely
     n = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     nn = n[:, None] * n[None, :]  # (2, 2, angles)
     tensors = jnp.broadcast_to(temperature.reshape(2, 2, -1), (2, 2, masses.size))
