@@ -124,6 +124,6 @@ def rival_arguments(flow: jg.ShearFlow, state: jg.State) -> dict[str, np.ndarray
         "shear_rate": float(flow.shear_rate),
         "restitution": float(flow.restitution),
         "timestep": float(flow.timestep),
-        "activation": flow.activation_fraction,
+        "activation": flow.activation,
         "tolerance": TOLERANCE,
     }

@@ -37,7 +37,7 @@ from synthetic import one_sentence, refused, snapshot_of
 
 import jaxgran as jg
 from jaxgran.analysis import fields
-from jaxgran.contact.residuals import contact_residuals
+from jaxgran.contact.solve_contacts import contact_residuals
 from jaxgran.dynamics import snapshots
 from jaxgran.io.trajectory import check_trajectory
 from jaxgran.maps import automatic, settings_checks

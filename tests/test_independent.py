@@ -37,7 +37,7 @@ class Plain:
             float(flow.timestep),
             float(flow.restitution),
         )
-        self.ahead, self.collisions = THETA[flow.activation] * self.dt, 0
+        self.ahead, self.collisions = flow.activation * self.dt, 0
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Grains i < j of each contact, unit normals from j to i, and relative normal

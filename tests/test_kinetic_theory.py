@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.theory import gaussian_moments as moments_module
-from jaxgran.theory.enskog import collisional_transfer
+from jaxgran.theory.enskog import collisional_transfer, enskog_collisions
 from jaxgran.theory.gaussian_moments import gaussian_moments
+from jaxgran.theory.mixture import uniform_mixture
 from jaxgran.theory.navier_stokes import garzo_dufty
 from jaxgran.theory.steady_shear import SteadyShear, contact_value, maxwellian_collision_rate
 
@@ -161,17 +161,6 @@ def test_contact_value_starts_from_the_second_virial_coefficient():
     np.testing.assert_allclose(jax.grad(contact_value)(0.0), 25 / 16)
 
 
-def test_collisional_transfer_is_that_of_the_moments_at_equal_temperatures():
-    tensor, alpha, nu = np.array([[0.5, -0.1], [-0.1, 0.3]]), jnp.asarray(0.6), jnp.asarray(0.5)
-    mixture = moments_module.uniform_mixture(nu, jnp.asarray(0.26), 4)
-    classes = np.repeat(np.array([0.5, 0.3, -0.1])[:, None], 4, axis=1)  # xx, yy, xy
-    expected = jax.jit(moments_module._collisions)(jnp.asarray(classes), alpha, mixture)
-    xx, yy, xy = expected.stress
-    found = collisional_transfer(jnp.asarray(tensor), alpha, nu)
-    np.testing.assert_allclose(found.stress, [[xx, xy], [xy, yy]], rtol=1e-12)
-    np.testing.assert_allclose(found.dissipation_rate, expected.dissipation, rtol=1e-12)
-
-
 def test_enskogs_dissipation_vanishes_in_the_elastic_limit_as_one_minus_the_squared_restitution():
     losses = [
         collisional_transfer(jnp.eye(2), alpha, 0.5).dissipation_rate for alpha in (1.0, 0.9, 0.0)
@@ -200,17 +189,17 @@ def test_collision_integrals_equal_averages_over_sampled_collisions():
     standard errors.
     """
     alpha, nu, samples = 0.6, 0.5, 100_000
-    mixture = jax.tree.map(
-        np.asarray, moments_module.uniform_mixture(jnp.asarray(nu), jnp.asarray(0.26), 2)
-    )
-    tensors = np.array([[0.5, 0.7], [0.3, 0.4], [-0.1, -0.15]])  # xx, yy, xy of the two classes
-    predicted = jax.jit(moments_module._collisions)(
-        jnp.asarray(tensors), jnp.asarray(alpha), mixture
+    mixture = jax.tree.map(np.asarray, uniform_mixture(jnp.asarray(nu), jnp.asarray(0.26), 2))
+    xx, yy, xy = np.array([[0.5, 0.7], [0.3, 0.4], [-0.1, -0.15]])  # of the two classes
+    tensors = np.array([[xx, xy], [xy, yy]])
+    predicted = jax.jit(enskog_collisions)(
+        jnp.asarray(tensors), jnp.asarray(alpha), jnp.asarray(1.0), mixture
     )
     masses, densities = mixture.masses, mixture.number_densities
     rng = np.random.default_rng(7)
 
-    totals = {"source": [], "stress": [], "dissipation": [], "rate": []}
+    names = "stress", "speed_stress", "dissipation_rate", "collision_rate"
+    totals = {name: [] for name in ("source", *names)}
     for i in range(2):
         source = 0
         for j in range(2):
@@ -218,8 +207,8 @@ def test_collision_integrals_equal_averages_over_sampled_collisions():
             angle = rng.uniform(0, 2 * np.pi, samples)
             normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
             own, other = (
-                rng.multivariate_normal([0, 0], [[xx, xy], [xy, yy]], samples) / np.sqrt(m)
-                for (xx, yy, xy), m in ((tensors[:, i], masses[i]), (tensors[:, j], masses[j]))
+                rng.multivariate_normal([0, 0], tensors[:, :, k], samples) / np.sqrt(masses[k])
+                for k in (i, j)
             )
             relative = own - other
             relative[:, 0] -= (
@@ -231,22 +220,23 @@ def test_collision_integrals_equal_averages_over_sampled_collisions():
             after = own - (impulse / masses[i])[:, None] * normal
             change = masses[i] * (products(after) - products(own))
             lost = (1 - alpha**2) / 2 * mixture.reduced_masses[i, j] * approach**2
-            source = source + weight[:, None] * change
+            source = source + weight[:, None, None] * change
             pair = densities[i] / 2 * weight
-            totals["stress"].append((pair * impulse * distance)[:, None] * products(normal))
-            totals["dissipation"].append(pair * lost)
-            totals["rate"].append(2 * pair / densities.sum())
+            moment = (pair * impulse * distance)[:, None, None] * products(normal)
+            totals["stress"].append(moment)
+            totals["speed_stress"].append(approach[:, None, None] * moment)
+            totals["dissipation_rate"].append(pair * lost)
+            totals["collision_rate"].append(2 * pair / densities.sum())
         totals["source"].append(source)
 
-    for name in ("stress", "dissipation", "rate"):
+    for name in names:
         assert_mean(sum(totals[name]), getattr(predicted, name))
     for i in range(2):
-        assert_mean(totals["source"][i], predicted.source[:, i])
+        assert_mean(totals["source"][i], predicted.source[:, :, i])
 
 
 def products(vectors):
-    x, y = vectors.T
-    return np.stack([x * x, y * y, x * y], axis=1)
+    return vectors[:, :, None] * vectors[:, None, :]
 
 
 def assert_mean(sample, expected):

@@ -26,7 +26,7 @@ from jaxgran import (
     Status,
     solve_contacts,
 )
-from jaxgran.contact.residuals import contact_residuals
+from jaxgran.contact.solve_contacts import contact_residuals
 
 SIZE = 12  # contacts of the matrices
 seeds = st.integers(0, 2**32 - 1)

@@ -25,8 +25,7 @@ from benchmarks.collection.make import padded
 from benchmarks.gauss_seidel import gauss_seidel
 from benchmarks.timing import timed
 from jaxgran.contact.problem import as_contacts
-from jaxgran.contact.residuals import contact_residuals
-from jaxgran.contact.solve_contacts import ContactSolution
+from jaxgran.contact.solve_contacts import ContactSolution, contact_residuals
 from jaxgran.model.status import Status
 
 CAP = 20_000  # products with W of our own methods
@@ -106,7 +105,7 @@ def _row(
 
 
 def residual_of(entry: Entry, impulses: np.ndarray) -> float:
-    """Residual of the natural map; see ``jaxgran.contact.residuals``."""
+    """Residual of the natural map; see ``jaxgran.contact.solve_contacts``."""
     network = padded(entry.problem)
     filled = np.zeros(len(network.approach))
     filled[: len(entry.problem.approach)] = impulses

@@ -109,7 +109,7 @@ def ladder(solver: Solver, entry: Entry, matrix) -> list[Attempt]:
 
 
 def natural_residual(entry: Entry, matrix, impulses: np.ndarray) -> float:
-    """‖min(W_cc p, w)‖ / ‖min(u⁻, 0)‖, as ``jaxgran.contact.residuals``."""
+    """‖min(W_cc p, w)‖ / ‖min(u⁻, 0)‖, as ``jaxgran.contact.solve_contacts``."""
     approach = entry.problem.approach
     least = np.minimum(matrix.diagonal() * impulses, matrix @ impulses + approach)
     return float(np.linalg.norm(least) / np.linalg.norm(np.minimum(approach, 0)))

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.law import largest_eigenvalue
 from jaxgran.contact.network import Contacts
-from jaxgran.contact.problem import DelassusProblem, entries, is_sparse
+from jaxgran.contact.problem import DelassusProblem, is_sparse
 from jaxgran.model.indexing import added_at, taken
 
 Operator = Contacts | DelassusProblem  # what has the functions product, diagonal and bound
@@ -99,7 +99,7 @@ def _(problem: DelassusProblem, impulses: Array, grains: int) -> Array:
 def _(problem: DelassusProblem, grains: int) -> Array:
     matrix = problem.matrix
     if is_sparse(matrix):
-        rows, columns, values = entries(matrix)
+        rows, columns, values = _entries(matrix)
         entries_on_diagonal = _row_sums(matrix, jnp.where(rows == columns, values, 0))
     else:
         entries_on_diagonal = jnp.diagonal(matrix)
@@ -116,9 +116,14 @@ def _(problem: DelassusProblem, grains: int) -> Array:
 def _times(matrix: Any, vector: Array) -> Array:
     """Product with a dense or sparse matrix, in full precision on every backend."""
     if is_sparse(matrix):
-        _, columns, values = entries(matrix)
+        _, columns, values = _entries(matrix)
         return _row_sums(matrix, values * vector[columns])
     return jnp.matmul(matrix, vector, precision=lax.Precision.HIGHEST)
+
+
+def _entries(matrix: Any) -> tuple[Array, Array, Array]:
+    """Rows, columns and values of the stored entries of a sparse matrix."""
+    return matrix.indices[:, 0], matrix.indices[:, 1], matrix.data
 
 
 def _row_sums(matrix: Any, values: Array) -> Array:

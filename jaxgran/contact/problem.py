@@ -1,18 +1,27 @@
-"""Contact problems of any origin: a network of discs, or a Delassus matrix.
+"""Contact problems of any origin, which ``solve_contacts`` takes: a network of discs, or a Delassus
+matrix.
 
-Both are what ``solve_contacts`` takes. Neither is checked when it is made, so that JAX may fill
-them with whatever it needs; ``problem_checks`` judges them where they are used.
+They are checked where they are used, not when they are made, so that JAX may fill them with
+whatever it needs. Shapes are checked even where JAX traces the values. Values that are traced pass,
+and end in a status: "ok" then still means that the residual is small, whatever the matrix is.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import scipy  # its parts are loaded when they are used
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.network import Contacts
 from jaxgran.model.batches import equal_values
+from jaxgran.model.checks import InputError, as_array, concrete_or_none, require, short_repr
+
+LARGEST_FACTORED = 2048  # contacts of a matrix whose eigenvalues are checked, which takes 0.1 s
+_UNIT_LENGTH = 1e-5  # error of the length of a normal; float32 and typed digits pass
+_BATCH = "a batch of problems is solved by jax.vmap(jaxgran.solve_contacts)"
 
 
 @jax.tree_util.register_dataclass
@@ -52,6 +61,11 @@ class ContactNetwork:
 
     __eq__ = equal_values
 
+    def __post_init__(self) -> None:
+        ends = np.asarray(self.ends) if isinstance(self.ends, (list, tuple)) else self.ends
+        object.__setattr__(self, "ends", ends)
+        _lists_as_arrays(self, "normals", "masses", "approach")
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -84,14 +98,15 @@ class DelassusProblem:
             from jax.experimental.sparse import BCOO
 
             object.__setattr__(self, "matrix", BCOO.from_scipy_sparse(self.matrix))
+        _lists_as_arrays(self, "matrix", "approach")
 
 
 ContactProblem = ContactNetwork | DelassusProblem
 
 
-def entries(matrix: Any) -> tuple[Array, Array, Array]:
-    """Rows, columns and values of the stored entries of a sparse matrix."""
-    return matrix.indices[:, 0], matrix.indices[:, 1], matrix.data
+def _lists_as_arrays(problem: Any, *names: str) -> None:
+    for name in names:
+        object.__setattr__(problem, name, as_array(getattr(problem, name)))
 
 
 def is_sparse(matrix: Any) -> bool:
@@ -113,3 +128,155 @@ def as_contacts(network: ContactNetwork) -> Contacts:
         inverse_mass_j=jnp.where(used, inverse[j], 0),
         used=used,
     )
+
+
+def as_problem(problem: ContactProblem) -> ContactProblem:
+    """A contact problem that was checked, with all its numbers in one precision."""
+    names = ("normals", "masses") if isinstance(problem, ContactNetwork) else ("matrix",)
+    numbers = {name: getattr(problem, name) for name in (*names, "approach")}
+    kind = np.result_type(*(x.dtype for x in numbers.values()))
+    kind = kind if jnp.issubdtype(kind, jnp.floating) else np.float64
+    kind = jax.dtypes.canonicalize_dtype(kind)
+    return replace(problem, **{name: x.astype(kind) for name, x in numbers.items()})
+
+
+def check_problem(problem: Any) -> None:
+    """Raise an InputError unless this is a contact problem whose shapes and values can be.
+
+    See ``solve_contacts`` for what is checked.
+    """
+    if not isinstance(problem, ContactNetwork | DelassusProblem):
+        raise InputError(
+            f"problem must be a ContactNetwork or a DelassusProblem, not {short_repr(problem)}."
+        )
+    if np.shape(problem.approach) == (0,):
+        raise InputError(
+            "approach must have a number for at least one contact: this problem has none to solve."
+        )
+    contacts = _length("approach", problem.approach, "contacts")
+    if isinstance(problem, ContactNetwork):
+        _check_network(problem, contacts)
+    else:
+        _check_delassus(problem, contacts)
+    require("approach", problem.approach, np.isfinite, "finite numbers")
+
+
+def _check_network(network: ContactNetwork, contacts: int) -> None:
+    require_shape("ends", network.ends, (contacts, 2), "two grains for each contact")
+    require_shape("normals", network.normals, (contacts, 2), "a unit vector for each contact")
+    grains = _length("masses", network.masses, "grains")
+    if not np.issubdtype(network.ends.dtype, np.integer):
+        raise InputError(f"ends must be whole numbers, not of the type {network.ends.dtype}.")
+    numbers = f"numbers of grains, 0 to {grains - 1}"
+    require("ends", network.ends, lambda x: (x >= 0) & (x < grains), numbers)
+    require("masses", network.masses, lambda x: x > 0, "positive, or infinite for a wall")
+    require("normals", network.normals, np.isfinite, "finite numbers")
+
+    ends, normals, masses = map(concrete_or_none, (network.ends, network.normals, network.masses))
+    if normals is None:
+        return
+    lengths = np.linalg.norm(normals, axis=1)
+    used = lengths > 0
+    wrong = used & (np.abs(lengths - 1) > _UNIT_LENGTH)
+    if np.any(wrong):
+        raise InputError(
+            f"normals must be unit vectors, and that of contact {np.argmax(wrong)} has the length "
+            f"{lengths[np.argmax(wrong)]:.6g}: divide it by its length."
+        )
+    if ends is None:
+        return
+    same_grain = used & (ends[:, 0] == ends[:, 1])
+    if np.any(same_grain):
+        raise InputError(
+            f"ends must be two different grains, and contact {np.argmax(same_grain)} has one grain "
+            "twice."
+        )
+    if masses is None:
+        return
+    two_walls = used & np.all(np.isinf(masses[ends]), axis=1)
+    if np.any(two_walls):
+        raise InputError(
+            f"contact {np.argmax(two_walls)} joins two walls, which no impulse moves: leave it out."
+        )
+
+
+def _check_delassus(problem: DelassusProblem, contacts: int) -> None:
+    matrix: Any = problem.matrix
+    require_shape("matrix", matrix, (contacts, contacts), "a row and a column for each contact")
+    sparse = is_sparse(matrix)
+    if sparse and (matrix.n_batch or matrix.n_dense):
+        raise InputError(
+            "a sparse matrix must have neither batch nor dense dimensions: use "
+            "BCOO.fromdense(matrix)."
+        )
+    if sparse and matrix.nse == 0:
+        raise InputError("matrix must have entries: a contact has a positive one on the diagonal.")
+    require("matrix", matrix.data if sparse else matrix, np.isfinite, "finite numbers")
+    known = _known_sparse(matrix) if sparse else concrete_or_none(matrix)
+    if known is not None:
+        _check_definite(known)
+
+
+def _known_sparse(matrix: Any) -> Any:
+    """A ``BCOO`` as a matrix of SciPy; None while JAX traces it."""
+    values, indices = concrete_or_none(matrix.data), concrete_or_none(matrix.indices)
+    if values is None or indices is None:
+        return None
+    inside = np.all(indices < matrix.shape, axis=1)  # a BCOO is padded with indices outside of it
+    coordinates = tuple(indices[inside].T)
+    return scipy.sparse.coo_array((values[inside], coordinates), shape=matrix.shape).tocsr()
+
+
+def _check_definite(matrix: Any) -> None:
+    """Symmetric, with a positive diagonal and no negative eigenvalue, all to rounding; the matrix
+    is one of NumPy or SciPy.
+    """
+    diagonal = matrix.diagonal()
+    if not np.all(diagonal > 0):
+        at = int(np.argmin(diagonal))
+        raise InputError(
+            f"matrix must have a positive diagonal, and entry {at} of it is {diagonal[at]:.6g}."
+        )
+    epsilon = float(np.finfo(matrix.dtype).eps) if matrix.dtype.kind == "f" else 0.0
+    root = np.sqrt(diagonal.astype(float))
+    scaled = matrix / root[:, None] / root
+    uneven = abs(scaled - scaled.T).max()
+    if uneven > np.sqrt(epsilon):
+        raise InputError(
+            "matrix must be symmetric, and entries differ from their mirror images by up to "
+            f"{uneven:.2g} of the diagonal: give (W + W.T) / 2 if that is rounding."
+        )
+    slack = 16 * len(diagonal) * epsilon
+    small = len(diagonal) <= LARGEST_FACTORED
+    if abs(scaled).max() > 1 + slack or (small and not _is_definite(scaled, slack)):
+        raise InputError(
+            "matrix must have no negative eigenvalue, as W = H M⁻¹ Hᵀ has none, and this one has."
+        )
+
+
+def _is_definite(scaled: Any, slack: float) -> bool:
+    dense = scaled.toarray() if scipy.sparse.issparse(scaled) else scaled
+    try:
+        np.linalg.cholesky(dense + slack * np.eye(len(dense)))
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def _length(name: str, value: Any, axis: str) -> int:
+    shape = np.shape(value) if hasattr(value, "dtype") else ()
+    if len(shape) != 1 or shape == (0,):
+        raise InputError(f"{name} must be an array ({axis},), not {_described(value)}; {_BATCH}.")
+    return shape[0]
+
+
+def require_shape(name: str, value: Any, shape: tuple[int, ...], words: str) -> None:
+    """Raise an InputError unless the value is an array of this shape, which holds ``words``."""
+    if not hasattr(value, "dtype") or np.shape(value) != shape:
+        raise InputError(
+            f"{name} must be an array {shape}, {words}, not {_described(value)}; {_BATCH}."
+        )
+
+
+def _described(value: Any) -> str:
+    return f"of the shape {np.shape(value)}" if hasattr(value, "dtype") else short_repr(value)

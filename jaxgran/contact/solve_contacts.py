@@ -1,4 +1,11 @@
-"""One call that solves any frictionless contact problem with the methods of the engines."""
+"""Any frictionless contact problem: solved by the methods of the engines, and residuals of impulses
+by the definitions in use.
+
+With w = u⁺ + α u⁻ = W p + (1 + α) u⁻ the law is 0 ≤ p ⟂ w ≥ 0. All residuals are made dimensionless
+by what stops every contact by itself: the speed v = (1 + α) ‖min(u⁻, 0)‖ and the energy
+E = (1 + α)² Σ min(u⁻, 0)²/W_cc. So they do not depend on units, and a list of problems has
+comparable numbers.
+"""
 
 from dataclasses import dataclass
 from functools import partial
@@ -6,18 +13,61 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxgran.contact.problem import ContactNetwork, ContactProblem, as_contacts
-from jaxgran.contact.problem_checks import as_problem, check_problem
-from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod, require_solver
-from jaxgran.contact.residuals import ContactResiduals, residuals_of
+from jaxgran.contact.delassus import Operator, delassus_product, diagonal
+from jaxgran.contact.problem import (
+    ContactNetwork,
+    ContactProblem,
+    as_contacts,
+    as_problem,
+    check_problem,
+    require_shape,
+)
+from jaxgran.contact.projected_methods import (
+    BarzilaiBorwein,
+    ProjectedMethod,
+    dot,
+    require_solver,
+)
 from jaxgran.contact.solver import solve
 from jaxgran.model.batches import equal_values
-from jaxgran.model.checks import require_number
+from jaxgran.model.checks import as_array, require_number
 from jaxgran.model.flow import RANGES
 
 _DEFAULT = BarzilaiBorwein(tolerance=1e-6)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ContactResiduals:
+    """How far impulses p are from a solution; all are zero at one, and none has a derivative.
+
+    ==================  =====  ====  ===============================================================
+    field               shape  unit  meaning
+    ==================  =====  ====  ===============================================================
+    natural_map         ()     –     ‖min(W_cc p, w)‖ / v; what ``tolerance`` is compared with
+    fischer_burmeister  ()     –     ‖a + w − √(a² + w²)‖ / v with a = W_cc p
+    complementarity     ()     –     largest |p w| of a contact / E
+    energy              ()     –     |p·w| / E; the energy after differs from that of the law by
+                                     p·w/(1 + α)
+    approach            ()     –     largest speed −w at which a contact still approaches / v
+    tension             ()     –     largest speed −W_cc p of an impulse that pulls / v
+    ==================  =====  ====  ===============================================================
+
+    w = u⁺ + α u⁻; v = (1 + α) ‖min(u⁻, 0)‖ and E = (1 + α)² Σ min(u⁻, 0)²/W_cc, or 1 where nothing
+    approaches.
+    """
+
+    natural_map: Float[Array, ""]
+    fischer_burmeister: Float[Array, ""]
+    complementarity: Float[Array, ""]
+    energy: Float[Array, ""]
+    approach: Float[Array, ""]
+    tension: Float[Array, ""]
+
+    __eq__ = equal_values
 
 
 @jax.tree_util.register_dataclass
@@ -88,13 +138,49 @@ def solve_contacts(
       ([1.333, 0.667], [1.0, 0.0])
     """
     check_problem(problem)
-    problem = as_problem(problem)
     require_number("restitution", restitution, *RANGES["restitution"])
     require_solver(solver)
+    problem = as_problem(problem)
     kind: Any = problem.approach.dtype
-    return _solved(
-        problem, jnp.asarray(restitution, kind), jax.tree.map(partial(_of_precision, kind), solver)
-    )
+    solver_of_kind = jax.tree.map(partial(_of_precision, kind), solver)
+    return _solved(problem, jnp.asarray(restitution, kind), solver_of_kind)
+
+
+def contact_residuals(
+    problem: ContactProblem, impulses: Any, restitution: float | Array = 0.0
+) -> ContactResiduals:
+    """Residuals of impulses from any solver; ``jit`` and ``vmap`` apply.
+
+    ===========  ===============================  ====  ===========================
+    argument     type or shape                    unit  meaning
+    ===========  ===============================  ====  ===========================
+    problem      ContactNetwork, DelassusProblem  –     the contact problem
+    impulses     (contacts,)                      mσγ̇   impulses p to judge
+    restitution  ()                               –     α in [0, 1]
+    ===========  ===============================  ====  ===========================
+
+    Sources: Fischer, Optimization 24, 269 (1992); Facchinei and Pang, Finite-Dimensional
+      Variational Inequalities (2003), chapter 1, for the natural map.
+
+    Raises:
+      InputError: (a ValueError) as ``solve_contacts``, or the impulses are not one number for each
+        contact.
+
+    Examples:
+      The impulse 1 stops two discs of mass 2 that approach at speed 1; half of it does not:
+
+      >>> from jaxgran.contact.problem import DelassusProblem
+      >>> pair = DelassusProblem(jnp.array([[1.0]]), jnp.array([-1.0]))
+      >>> [float(contact_residuals(pair, jnp.array([p])).natural_map) for p in (1.0, 0.5)]
+      [0.0, 0.5]
+    """
+    check_problem(problem)
+    impulses = as_array(impulses)
+    require_shape("impulses", impulses, problem.approach.shape, "a number for each contact")
+    require_number("restitution", restitution, *RANGES["restitution"])
+    problem = as_problem(problem)
+    kind: Any = problem.approach.dtype
+    return _residuals(problem, jnp.asarray(impulses, kind), jnp.asarray(restitution, kind))
 
 
 def _of_precision(kind: Any, number: Any) -> Array:
@@ -104,21 +190,54 @@ def _of_precision(kind: Any, number: Any) -> Array:
     )
 
 
+def _operator(problem: ContactProblem) -> tuple[Operator, int]:
+    """The Delassus operator of a problem, and its number of grains, 0 for a matrix."""
+    if isinstance(problem, ContactNetwork):
+        return as_contacts(problem), problem.masses.size
+    return problem, 0
+
+
 @jax.jit
 def _solved(
     problem: ContactProblem, restitution: Array, solver: ProjectedMethod
 ) -> ContactSolution:
-    network = isinstance(problem, ContactNetwork)
-    operator = as_contacts(problem) if network else problem
-    grains = problem.masses.size if network else 0
-    fastest = jax.lax.stop_gradient(jnp.max(jnp.abs(operator.approach)))
-    always = jnp.asarray(True)
-    solution = solve(operator, grains, fastest, solver, always)
+    operator, grains = _operator(problem)
+    fastest = lax.stop_gradient(jnp.max(jnp.abs(operator.approach)))
+    solution = solve(operator, grains, fastest, solver, jnp.asarray(True))
     impulses = (1 + restitution) * solution.impulses
     return ContactSolution(
         impulses=impulses,
         velocities=operator.approach + (1 + restitution) * solution.response,
-        residuals=residuals_of(problem, impulses, restitution),
+        residuals=_residuals(problem, impulses, restitution),
         iterations=solution.iterations,
         status=solution.status,
     )
+
+
+@jax.jit
+def _residuals(problem: ContactProblem, impulses: Array, restitution: Array) -> ContactResiduals:
+    operator, grains = _operator(problem)
+    w_diagonal = diagonal(operator, grains)
+    after = delassus_product(operator, impulses, grains) + (1 + restitution) * operator.approach
+    stopped = (1 + restitution) * jnp.minimum(operator.approach, 0)
+    speed, energy = jnp.sqrt(dot(stopped, stopped)), dot(stopped, stopped / w_diagonal)
+    speed, energy = (jnp.where(x > 0, x, 1) for x in (speed, energy))
+    push, work = w_diagonal * impulses, impulses * after
+    least, merged = jnp.minimum(push, after), _fischer_burmeister(push, after)
+    residuals = ContactResiduals(
+        natural_map=jnp.sqrt(dot(least, least)) / speed,
+        fischer_burmeister=jnp.sqrt(dot(merged, merged)) / speed,
+        complementarity=jnp.max(jnp.abs(work)) / energy,
+        energy=jnp.abs(jnp.sum(work)) / energy,
+        approach=jnp.maximum(0, -jnp.min(after)) / speed,
+        tension=jnp.maximum(0, -jnp.min(push)) / speed,
+    )
+    return jax.tree.map(lax.stop_gradient, residuals)
+
+
+def _fischer_burmeister(a: Array, b: Array) -> Array:
+    """a + b − √(a² + b²), without the cancellation that hides one small number beside a large
+    one.
+    """
+    length, total = jnp.hypot(a, b), a + b
+    return jnp.where(total > 0, 2 * a * b / jnp.where(total > 0, total + length, 1), total - length)

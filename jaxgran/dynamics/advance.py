@@ -264,7 +264,7 @@ def call_numba(
         flow.shear_rate,
         solver.tolerance,
     )
-    numbers = (*numbers, flow.activation_fraction, solver.max_steps, suspended)
+    numbers = (*numbers, flow.activation, solver.max_steps, suspended)
     record = layout.record_numbers(count)
     kept = numba_memory(flow).shape if room > 0 else (0,)  # without records nothing goes on in it
     shapes = [

@@ -96,7 +96,7 @@ def contacts_now(flow: ShearFlow, state: State) -> tuple[Contacts, Int[Array, ""
     grains, velocities = state.grains, state.velocities
     pairs = outer_pairs(state.positions, grains, state.side, state.tilt)
     motion = pair_motion(pairs.i, pairs.j, pairs.separations, velocities, flow.shear_rate)
-    look_ahead = flow.activation_fraction * flow.timestep
+    look_ahead = flow.activation * flow.timestep
     contact, _ = is_contact(motion, pairs.reach, look_ahead)
     room = MOST_CONTACTS * grains.radii.size
     suffices = pairs.skin >= closing_speed_bound(flow, grains, velocities, pairs.skin) * look_ahead

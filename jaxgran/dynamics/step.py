@@ -119,7 +119,7 @@ def unfinished(advance: Advance, now: Carry) -> Bool[Array, ""]:
 def needs_lists(advance: Advance, now: Carry) -> Bool[Array, ""]:
     """Whether the near list may miss a contact of the next step, which looks θ·dt beyond itself."""
     flow = advance.flow
-    suffices = now.slack >= now.closing_speed * (1 + flow.activation_fraction) * flow.timestep
+    suffices = now.slack >= now.closing_speed * (1 + flow.activation) * flow.timestep
     return unfinished(advance, now) & ~suffices
 
 
@@ -165,7 +165,7 @@ def event(advance: Advance, now: Carry) -> Carry:
     jump = _steps_to_fly(advance, now)
     flown = fly(advance, now, jump)
 
-    spare = flown.slack - now.closing_speed * flow.activation_fraction * flow.timestep
+    spare = flown.slack - now.closing_speed * flow.activation * flow.timestep
     expired = spare < -16 * jnp.finfo(spare.dtype).eps * near.skin
     needs_solve = going & (flown.step < advance.steps) & ~(expired & (jump > 0))
     collided = collide(advance, flown, needs_solve)
@@ -185,12 +185,10 @@ def _steps_to_fly(advance: Advance, now: Carry) -> Int[Array, ""]:
     """
     flow, least = advance.flow, now.solved.astype(jnp.int32)
     time, closest = first_contact_time(now.pairs, now.lists.near.reach)
-    steps = jnp.maximum(
-        first_step(time, flow.timestep, flow.activation_fraction), least.astype(time.dtype)
-    )
+    steps = jnp.maximum(first_step(time, flow.timestep, flow.activation), least.astype(time.dtype))
     to_contact = smallest(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
     longest = jnp.divide(LONGEST_FLIGHT, flow.shear_rate) / flow.timestep
-    of_list = now.slack / now.closing_speed / flow.timestep - flow.activation_fraction
+    of_list = now.slack / now.closing_speed / flow.timestep - flow.activation
     jump = jnp.minimum(to_contact, jnp.floor(jnp.minimum(of_list, longest)))
     wanted = jnp.where(advance.free_flight, jump, 0)
     remaining = advance.steps - now.step
@@ -263,7 +261,7 @@ def collide(advance: Advance, now: Carry, needs_solve: Bool[Array, ""]) -> Carry
     solved and summed there; more than the largest buffer holds are solved and summed on the list.
     """
     near, grains, flow = now.lists.near, advance.grains, advance.flow
-    look_ahead = flow.activation_fraction * flow.timestep
+    look_ahead = flow.activation * flow.timestep
     all_contacts, approaching = is_contact(now.pairs, near.reach, look_ahead)
     acts = needs_solve & jnp.any(bit_words(approaching) > 0)
     contact, motion, delays = all_contacts & acts, now.pairs, None

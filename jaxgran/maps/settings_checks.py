@@ -131,7 +131,7 @@ def _check_timesteps(settings: MapSettings, flows: ShearFlow) -> None:
         most = f"{MAX_STEPS} time steps, that is {MAX_STEPS * shortest:g}"
         raise refused("strain", strain, f"must be at most {most}")
     temperature = temperature_of(settings, flows)
-    limits = longest_timestep(temperature, flows.packing_fraction, settings.activation)
+    limits = longest_timestep(temperature, flows.packing_fraction, flows.activation)
     excess = np.asarray(flows.timestep) / limits
     worst = int(np.argmax(excess))
     if excess[worst] > 1:

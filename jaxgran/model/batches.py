@@ -37,9 +37,7 @@ class Indexable:
                 f"an index takes one of {self._whole}, and this is one {name}, not {self._whole}."
             )
         if not is_traced(place):
-            np.broadcast_to(0, self._axes)[
-                place
-            ]  # JAX would take the last in place of one that is not there
+            np.broadcast_to(0, self._axes)[place]  # JAX would take the last for one beyond it
         return jax.tree.map(lambda leaf: leaf[place], self)
 
     def __len__(self) -> int:
@@ -55,12 +53,11 @@ class Indexable:
 
 
 def equal_values(one: Any, other: object) -> bool:
-    """Whether two values are of one class and hold equal numbers of equal shapes: the method
-    ``__eq__``.
+    """The method ``__eq__``: whether two values are of one class and hold equal numbers of equal
+    shapes.
 
     Libraries, precisions and NaN do not matter: an array of NumPy equals one of JAX, and NaN equals
-      NaN in its place. Parameters that are not traced, such as the number of grains, must be equal,
-      too.
+    NaN in its place. Static fields, such as the number of grains, must be equal, too.
 
     Raises:
       InputError: JAX traces one of the values.
@@ -70,12 +67,8 @@ def equal_values(one: Any, other: object) -> bool:
     if is_traced(one, other):
         raise InputError(
             f"two values of {type(one).__name__} cannot be compared while JAX traces them: compare "
-            "them before or "
-            "after, or their arrays by jnp.array_equal."
+            "them before or after, or their arrays by jnp.array_equal."
         )
-    one, other = (
-        vars(x) if jax.tree_util.all_leaves([x]) else x for x in (one, other)
-    )  # what is no pytree
     (leaves, structure), (others, of_other) = jax.tree.flatten(one), jax.tree.flatten(other)
     return structure == of_other and all(map(_equal, leaves, others))
 
@@ -83,17 +76,6 @@ def equal_values(one: Any, other: object) -> bool:
 def _equal(one: Any, other: Any) -> bool:
     numbers = all(np.asarray(x).dtype.kind == "f" for x in (one, other))
     return one is other or np.array_equal(one, other, equal_nan=numbers)
-
-
-def hash_of_values(self: Any) -> int:
-    """The method ``__hash__`` that agrees with ``equal_values``, for values that may hold single
-    numbers of Python.
-
-    Raises:
-      TypeError: it holds an array.
-    """
-    leaves, structure = jax.tree.flatten(self)
-    return hash((structure, *leaves))
 
 
 def in_numpy(tree: T) -> T:

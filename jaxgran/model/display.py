@@ -5,13 +5,10 @@ no more space than one. A traced value is shown by its type.
 """
 
 import math
-from collections import Counter
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
-
-from jaxgran.model.status import Status
 
 _LONGEST_REPR = 100  # characters of a value that is not a number
 _LEAST_SHOWN = 1e-6  # relative error; digits below it are not shown
@@ -19,25 +16,17 @@ _TWO_DIGITS = 3.55  # an error that begins with less has two digits
 _SMALLEST_PLAIN, _LARGEST_ROUNDED = -4, 5  # powers of ten of numbers without an exponent
 
 
-class Row(NamedTuple):
-    """One property to show, and its error, None where it is not known."""
-
-    name: str
-    value: Any
-    error: Any = None
-
-
-def text_of(title: str, rows: Sequence[Row]) -> str:
-    """One line: the title, then the rows as ``name=value`` in brackets."""
-    return f"{title}({', '.join(f'{row.name}={value_text(row.value, row.error)}' for row in rows)})"
-
-
-def value_text(value: Any, error: Any = None) -> str:
-    """A value as short text.
+def text_of(title: str, values: Mapping[str, Any], errors: Mapping[str, Any] | None = None) -> str:
+    """One line: the title, then ``name=value`` of each value in brackets.
 
     A single number is shown with its error, if known. Many numbers are shown by shape and range.
     Any other value is shown by its ``repr``.
     """
+    texts = (f"{name}={_text(value, (errors or {}).get(name))}" for name, value in values.items())
+    return f"{title}({', '.join(texts)})"
+
+
+def _text(value: Any, error: Any) -> str:
     numbers = _numbers(value)
     if numbers is None:
         words = " ".join(repr(value).split())
@@ -104,21 +93,11 @@ def _numbers(value: Any) -> np.ndarray | None:
     return array if array.dtype.kind in "iuf" else None
 
 
-def statuses(codes: np.ndarray) -> str:
-    """The name of one status, or the names of many with their counts."""
-    names = Counter(Status(int(code)).name for code in np.ravel(codes))
-    return ", ".join(
-        name if np.ndim(codes) == 0 else f"{name} ({count})" for name, count in names.most_common()
-    )
-
-
 def rounded(value: Any) -> Any:
     """A single measured number to six digits; an array unchanged."""
     return float(f"{float(value):.6g}") if np.ndim(value) == 0 else value
 
 
-def arrays(*leaves: Any) -> list[np.ndarray]:
-    """The leaves as arrays; an empty list if one of them is traced or not numeric."""
-    found = [_numbers(leaf) for leaf in leaves]
-    known = [x for x in found if x is not None]
-    return known if len(known) == len(found) else []
+def are_numbers(*leaves: Any) -> bool:
+    """Whether all leaves are numeric, and none is traced."""
+    return all(_numbers(leaf) is not None for leaf in leaves)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxgran.model.batches import Indexable, equal_values, hash_of_values
+from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.checks import (
     InputError,
     as_array,
@@ -25,15 +25,22 @@ from jaxgran.model.choices import (
     MAX_PACKING_FRACTION,
     MAX_STEPS,
     MIN_GRAINS,
-    Activation,
 )
-from jaxgran.model.display import Row, text_of
+from jaxgran.model.display import text_of
 
-_LOOK_AHEAD = {"midpoint": 0.5, "touching": 0.0}  # θ of the activation rules
+_THETA = {"midpoint": 0.5, "touching": 0.0}  # of the activation rules
 
-
-def _rows(flow: "ShearFlow") -> list[Row]:
-    return [Row(name, getattr(flow, name)) for name in flow.__dataclass_fields__]
+RANGES = {
+    "restitution": (lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
+    "packing_fraction": (
+        lambda x: (x > 0) & (x <= MAX_PACKING_FRACTION),
+        f"above 0 and at most {MAX_PACKING_FRACTION}",
+    ),
+    "timestep": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
+    "shear_rate": (lambda x: (x >= 0) & np.isfinite(x), "a number of at least 0"),
+    "polydispersity": (lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),
+    "activation": (lambda x: (x == 0.5) | (x == 0), " or ".join(_THETA)),
+}
 
 
 @dataclass(frozen=True)
@@ -44,9 +51,8 @@ class ShearFlow(Indexable):
     diameter σ. ``grains`` is static. All other fields are traced: changing them recompiles nothing.
     A batch of flows is one ``ShearFlow`` whose numbers are lists or arrays with a leading
     ``(replicas,)`` axis; numbers that are the same for all are broadcast, and ``flows[0]`` is the
-    first of them. JAX traces the number θ of ``activation``, so a batch, and the flow that a
-    transformed function receives, have θ in that field. How a flow is solved is no part of it: see
-    the arguments ``solver`` and ``engine`` of ``sample``.
+    first of them. How a flow is solved is no part of it: see the arguments ``solver`` and
+    ``engine`` of ``sample``.
 
     ================  =================  ===========================================================
     field             unit               meaning
@@ -59,10 +65,9 @@ class ShearFlow(Indexable):
     shear_rate        1/time             γ̇ ≥ 0; 0 in free cooling, where the unit of time is free
     polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ; not used with
                                          ``own_grains``
-    activation        –                  "midpoint": contact if the grains overlap after half a step
-                                         of free flight;
-                                         "touching": contact if the grains overlap now; or θ, 0.5 or
-                                         0
+    activation        –                  θ, the part of a step of free flight after which grains
+                                         that overlap are in contact: 0.5, given as "midpoint", or
+                                         0, given as "touching"
     ================  =================  ===========================================================
 
     Raises:
@@ -81,22 +86,25 @@ class ShearFlow(Indexable):
     timestep: float | jax.Array
     shear_rate: float | jax.Array = 1.0
     polydispersity: float | jax.Array = 0.26
-    activation: Activation | float | jax.Array = "midpoint"
+    activation: Any = "midpoint"
 
-    __eq__, __hash__ = equal_values, hash_of_values
+    __eq__ = equal_values
+
+    def __hash__(self) -> int:
+        leaves, structure = jax.tree.flatten(self)
+        return hash((structure, *leaves))
 
     def __repr__(self) -> str:
-        return text_of("ShearFlow", _rows(self))
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        if isinstance(self.activation, float):
+            rules = {theta: rule for rule, theta in _THETA.items()}
+            values["activation"] = rules.get(self.activation, self.activation)
+        return text_of("ShearFlow", values)
 
     def __post_init__(self):
         require_whole("grains", self.grains, MIN_GRAINS, MAX_GRAINS, "as memory is limited")
-        if not isinstance(self.activation, str) or self.activation not in _LOOK_AHEAD:
-            require(
-                "activation",
-                self.activation,
-                lambda x: (x == 0.5) | (x == 0),
-                " or ".join(_LOOK_AHEAD),
-            )
+        if isinstance(self.activation, str):
+            object.__setattr__(self, "activation", _THETA.get(self.activation, self.activation))
         for name, (accepts, words) in RANGES.items():
             object.__setattr__(self, name, as_array(getattr(self, name)))
             require(name, getattr(self, name), accepts, words)
@@ -124,27 +132,16 @@ class ShearFlow(Indexable):
     def _axes(self) -> tuple[int, ...]:
         return np.shape(self.restitution)
 
-    @property
-    def activation_fraction(self) -> float | jax.Array:
-        """θ: fraction of a time step of free flight after which an overlapping pair is a
-        contact.
-        """
-        return _LOOK_AHEAD[self.activation] if isinstance(self.activation, str) else self.activation
-
 
 _TRACED_FIELDS = tuple(f.name for f in fields(ShearFlow) if not f.metadata.get("static"))
 _STATIC_FIELDS = tuple(f.name for f in fields(ShearFlow) if f.metadata.get("static"))
-
-
-def _traced(flow: ShearFlow, name: str) -> Any:
-    return flow.activation_fraction if name == "activation" else getattr(flow, name)
 
 
 def _broadcast(flow: ShearFlow, shape: tuple[int, ...]) -> None:
     """Give every number of a batch its axis of replicas, in the precision of those that have it
     already.
     """
-    numbers = {name: _traced(flow, name) for name in _TRACED_FIELDS}
+    numbers = {name: getattr(flow, name) for name in _TRACED_FIELDS}
     kind = jnp.result_type(*(value for value in numbers.values() if np.ndim(value)))
     kind = kind if jnp.issubdtype(kind, jnp.floating) else jnp.result_type(float)
     for name, value in numbers.items():
@@ -171,22 +168,11 @@ def _unflatten(static: tuple, traced: Iterable) -> ShearFlow:
 jax.tree_util.register_pytree_with_keys(
     ShearFlow,
     lambda flow: (
-        [(jax.tree_util.GetAttrKey(name), _traced(flow, name)) for name in _TRACED_FIELDS],
+        [(jax.tree_util.GetAttrKey(name), getattr(flow, name)) for name in _TRACED_FIELDS],
         tuple(getattr(flow, name) for name in _STATIC_FIELDS),
     ),
     _unflatten,
 )
-
-RANGES = {
-    "restitution": (lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
-    "packing_fraction": (
-        lambda x: (x > 0) & (x <= MAX_PACKING_FRACTION),
-        f"above 0 and at most {MAX_PACKING_FRACTION}",
-    ),
-    "timestep": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
-    "shear_rate": (lambda x: (x >= 0) & np.isfinite(x), "a number of at least 0"),
-    "polydispersity": (lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),
-}
 
 
 def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:

@@ -1,5 +1,6 @@
 """State: a sheared packing at one instant, the check of a state, and its energy and momentum."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -11,33 +12,12 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.checks import InputError, is_traced
-from jaxgran.model.display import Row, arrays, rounded, text_of
+from jaxgran.model.display import are_numbers, rounded, text_of
 from jaxgran.model.flow import ShearFlow, require_flow
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import Status
 
 _ROUNDING = 1e-5  # of a packing fraction or a diameter in float32, with some room
-
-
-def _rows(state: "State") -> list[Row]:
-    known = arrays(state.grains.radii, state.grains.masses, state.velocities)
-    if not known or known[-1].ndim < 2:
-        return [Row("positions", state.positions), Row("side", state.side), Row("tilt", state.tilt)]
-    radii, masses, velocities = known
-    *replicas, grains, _ = velocities.shape
-    temperature = np.sum(masses[..., None] * velocities**2, axis=(-2, -1)) / (2 * grains)
-    return [
-        *[Row("replicas", count) for count in replicas],
-        Row("grains", grains),
-        Row(
-            "packing_fraction",
-            rounded(np.sum(np.pi * radii**2, axis=-1) / np.asarray(state.side) ** 2),
-        ),
-        Row("granular_temperature", rounded(temperature)),
-        Row("side", rounded(state.side)),
-        Row("tilt", rounded(state.tilt)),
-        Row("precision", str(velocities.dtype)),
-    ]
 
 
 @jax.tree_util.register_dataclass
@@ -65,7 +45,27 @@ class State(Indexable):
     __eq__ = equal_values
 
     def __repr__(self) -> str:
-        return text_of("State", _rows(self))
+        cell = {"side": self.side, "tilt": self.tilt}
+        numbers = self.grains.radii, self.grains.masses, self.velocities, *cell.values()
+        if not are_numbers(*numbers) or np.ndim(self.velocities) < 2:
+            return text_of("State", {"positions": self.positions, **cell})
+        radii, masses, velocities, side, _ = map(np.asarray, numbers)
+        *replicas, grains, _ = velocities.shape
+        temperature = np.sum(masses[..., None] * velocities**2, axis=(-2, -1)) / (2 * grains)
+        values = {
+            "packing_fraction": np.sum(np.pi * radii**2, axis=-1) / side**2,
+            "granular_temperature": temperature,
+            **cell,
+        }
+        return text_of(
+            "State",
+            {
+                **({"replicas": math.prod(replicas)} if replicas else {}),
+                "grains": grains,
+                **{name: rounded(value) for name, value in values.items()},
+                "precision": str(velocities.dtype),
+            },
+        )
 
     @property
     def _axes(self) -> tuple[int, ...]:

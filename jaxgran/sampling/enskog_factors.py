@@ -58,7 +58,7 @@ from jaxgran.model.grains import Grains
 from jaxgran.sampling.prediction import size_classes
 from jaxgran.sampling.sample import Sample, durations
 from jaxgran.statistics import Estimates, standard_errors
-from jaxgran.theory.enskog import CollisionalTransfer, collisional_transfer, mixture_transfer
+from jaxgran.theory.enskog import Collisions, collisional_transfer, enskog_collisions
 from jaxgran.theory.mixture import mixture_of
 
 RATES = {
@@ -185,9 +185,9 @@ def _enskog(
 @persistent_jit
 def _collisional_transfer(
     tensors: Float[Array, "tensors 2 2"], classes: Any, *numbers: Array
-) -> CollisionalTransfer:
+) -> Collisions:
     if classes is None:
         return jax.vmap(lambda tensor: collisional_transfer(tensor, *numbers))(tensors)
     (alpha, nu, rate, _), (diameters, masses) = numbers, classes
     mixture = mixture_of(nu, diameters, masses, jnp.full(diameters.shape, 1 / diameters.size))
-    return jax.vmap(lambda tensor: mixture_transfer(tensor, alpha, rate, mixture))(tensors)
+    return jax.vmap(lambda tensor: enskog_collisions(tensor, alpha, rate, mixture))(tensors)

@@ -1,9 +1,9 @@
 """What kinetic theory predicts for a batch of flows, as arrays of NumPy."""
 
 from itertools import pairwise
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
@@ -31,18 +31,13 @@ def kinetic_theory(
     Given grains (replicas, grains) are taken as a mixture of eight classes, sorted by diameter and
     then by mass.
     """
-    if grains is not None:
-        return jax.tree.map(
-            np.asarray, _mixture_moments(restitution, packing_fraction, shear_rate, grains)
-        )
     numbers = np.stack(
         np.broadcast_arrays(restitution, packing_fraction, shear_rate, polydispersity), axis=-1
     )
+    classes = () if grains is None else [x.astype(numbers.dtype) for x in size_classes(grains)]
     count = len(numbers)
-    filled = numbers[np.arange(-(-count // _TOGETHER) * _TOGETHER) % count].reshape(
-        -1, _TOGETHER, 4
-    )
-    parts = [jax.tree.map(np.asarray, _gaussian_moments(part)) for part in filled]
+    places = np.arange(-(-count // _TOGETHER) * _TOGETHER).reshape(-1, _TOGETHER) % count
+    parts = [_moments(numbers[some], *(x[some] for x in classes)) for some in places]
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
 
 
@@ -59,27 +54,23 @@ def predicted(flow: ShearFlow, grains: Grains | None = None) -> SteadyShear:
 
 
 @persistent_jit
-def _gaussian_moments(numbers: Float[Array, "flows 4"]) -> SteadyShear:
-    return jax.vmap(gaussian_moments)(*numbers.T)
+def _moments(numbers: Float[Array, "flows 4"], *classes: Float[Array, "flows classes"]) -> Any:
+    if not classes:
+        return jax.vmap(gaussian_moments)(*numbers.T)
+    alpha, nu, rate, _ = numbers.T
+    return jax.vmap(mixture_moments)(alpha, nu, rate, *classes)
 
 
-@persistent_jit
-def _mixture_moments(
-    alpha: Array, packing_fraction: Array, shear_rate: Array, grains: Grains
-) -> SteadyShear:
-    return jax.vmap(mixture_moments)(
-        alpha, packing_fraction, shear_rate, *jax.vmap(size_classes)(grains)
-    )
-
-
-def size_classes(grains: Grains) -> tuple[Float[Array, " classes"], Float[Array, " classes"]]:
-    """Mean diameters and masses of classes of equal numbers of grains, sorted by diameter and then
-    by mass.
+def size_classes(grains: Grains) -> tuple[np.ndarray, np.ndarray]:
+    """Mean diameters and masses (..., classes) of classes of equal numbers of grains (..., grains),
+    sorted by diameter and then by mass.
     """
-    order = jnp.lexsort((grains.masses, grains.radii))
-    edges = np.arange(_SIZE_CLASSES + 1) * order.size // _SIZE_CLASSES
-    members = [order[first:last] for first, last in pairwise(edges)]
-    diameters = jnp.stack([2 * jnp.mean(grains.radii[one]) for one in members])
-    return diameters / jnp.mean(diameters), jnp.stack(
-        [jnp.mean(grains.masses[one]) for one in members]
+    radii, masses = np.asarray(grains.radii), np.asarray(grains.masses)
+    order = np.lexsort((masses, radii))
+    edges = np.arange(_SIZE_CLASSES + 1) * order.shape[-1] // _SIZE_CLASSES
+    members = [order[..., first:last] for first, last in pairwise(edges)]
+    mean_radii, mean_masses = (
+        np.stack([np.mean(np.take_along_axis(x, one, -1), -1) for one in members], axis=-1)
+        for x in (radii, masses)
     )
+    return mean_radii / np.mean(mean_radii, -1, keepdims=True), mean_masses

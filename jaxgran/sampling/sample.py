@@ -2,6 +2,7 @@
 from them.
 """
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -30,9 +31,10 @@ from jaxgran.model.checks import (
     short_repr,
     two_digits,
 )
-from jaxgran.model.display import Row, arrays, rounded, statuses, text_of
+from jaxgran.model.display import are_numbers, rounded, text_of
 from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
 from jaxgran.model.state import State, require_match, require_state
+from jaxgran.model.status import Status
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.correlation_strain import flow_correlation_strain, length_status
 from jaxgran.sampling.observables import OBSERVABLES, Averages
@@ -61,22 +63,6 @@ _SHOWN = (
     *("force_ratio", "pressure", "shear_stress", "granular_temperature"),
     *("coordination_number", "macroscopic_friction", "inertial_number"),
 )
-
-
-def _rows(sample: "Sample") -> list[Row]:
-    known = arrays(*(getattr(sample.tally, name) for name in TABLE), sample.area, sample.shear_rate)
-    if not known or np.ndim(sample.tally.contact_moment) < 3:
-        return [Row("grains", sample.grains), Row("area", sample.area, "σ²")]
-    here = in_numpy(sample)
-    averages = here.averages
-    errors = here.errors() if np.ndim(here.area) == 0 else {}
-    return [
-        *[Row("replicas", count) for count in np.shape(here.area)],
-        Row("grains", here.grains),
-        Row("strain", rounded(here.strain)),
-        *(Row(name, averages[name], errors.get(name)) for name in _SHOWN),
-        Row("status", statuses(np.asarray(here.status))),
-    ]
 
 
 @jax.tree_util.register_dataclass
@@ -108,7 +94,27 @@ class Sample(Averages, Indexable):
     __eq__ = equal_values
 
     def __repr__(self) -> str:
-        return text_of("Sample", _rows(self))
+        numbers = [getattr(self.tally, name) for name in TABLE]
+        if (
+            not are_numbers(*numbers, self.area, self.shear_rate)
+            or np.ndim(self.tally.contact_moment) < 3
+        ):
+            return text_of("Sample", {"grains": self.grains, "area": self.area})
+        sample = in_numpy(self)
+        single, averages, status = not self._axes, sample.averages, np.asarray(sample.status)
+        counts = Counter(Status(int(code)).name for code in status.flat).most_common()
+        names = (name if single else f"{name} ({count})" for name, count in counts)
+        return text_of(
+            "Sample",
+            {
+                **({} if single else {"replicas": status.size}),
+                "grains": self.grains,
+                "strain": rounded(sample.strain),
+                **{name: averages[name] for name in _SHOWN},
+                "status": ", ".join(names),
+            },
+            sample.errors() if single else None,
+        )
 
     @property
     def _axes(self) -> tuple[int, ...]:

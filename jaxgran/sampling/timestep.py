@@ -19,7 +19,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxgran.model.checks import InputError, two_digits
-from jaxgran.model.choices import SHORTEST_TIMESTEP, Activation
+from jaxgran.model.choices import SHORTEST_TIMESTEP
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import DEEP_OVERLAP
@@ -48,16 +48,13 @@ def expected_temperature(
 
 
 def longest_timestep(
-    temperature: ArrayLike, packing_fraction: ArrayLike, activation: Activation
+    temperature: ArrayLike, packing_fraction: ArrayLike, activation: ArrayLike
 ) -> np.ndarray:
     """Longest time step, in t, for which a sample of strain 10 and some hundred grains has no deep
-    overlap.
+    overlap, by θ of the activation rule.
     """
-    overlap = (
-        2.5
-        + 1.23 / np.sqrt(distance_to_jamming(packing_fraction))
-        + (3 if activation == "touching" else 0)
-    )
+    late = np.where(np.asarray(activation) == 0, 3, 0)
+    overlap = 2.5 + 1.23 / np.sqrt(distance_to_jamming(packing_fraction)) + late
     return DEEP_OVERLAP / (overlap * np.sqrt(np.asarray(temperature)))
 
 
@@ -78,7 +75,7 @@ def stress_error(crossing: ArrayLike, packing_fraction: ArrayLike) -> np.ndarray
 
 
 def automatic_timestep(
-    temperature: ArrayLike, packing_fraction: ArrayLike, activation: Activation, target_error: float
+    temperature: ArrayLike, packing_fraction: ArrayLike, activation: ArrayLike, target_error: float
 ) -> np.ndarray:
     """Longest time step, in t, with a stress error within the target and no deep overlap."""
     crossing = target_error / stress_error(1.0, packing_fraction)

@@ -1,14 +1,10 @@
-"""Mixtures of a few size classes, and the moments of approaching pairs with Gaussian velocities."""
+"""Mixtures of a few size classes."""
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-
-# Contact directions on the half circle; the integrand is smooth and periodic: errors below 1e-11
-ANGLES = 32
 
 
 class Mixture(NamedTuple):
@@ -57,14 +53,3 @@ def mixture_contact_value(d_i: Any, d_j: Any, nu: Any, mean: Any, mean_square: A
     Source: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
     """
     return 1 / (1 - nu) + 9 / 8 * d_i * d_j / (d_i + d_j) * nu * mean / mean_square / (1 - nu) ** 2
-
-
-def half_range_moments(mean: Array, deviation: Array) -> tuple[Array, Array, Array]:
-    """First, second and third moment of a Gaussian, restricted to positive values."""
-    z = mean / deviation
-    above = jax.lax.erfc(-z / jnp.sqrt(2.0).astype(z.dtype)) / 2
-    bell = jnp.exp(-(z**2) / 2) / np.sqrt(2 * np.pi).item()
-    first = deviation * (z * above + bell)
-    second = deviation**2 * ((z**2 + 1) * above + z * bell)
-    third = deviation**3 * ((z**2 + 3) * z * above + (z**2 + 2) * bell)
-    return first, second, third
