@@ -122,7 +122,11 @@ def _with_records(
     flow: ShearFlow, state: State, observe: Observe, user_sums: Any, call: NumbaCall, flown: Array
 ) -> Any:
     """The user sums with what is found in the records of a call, up to the step ``flown``."""
-    from jaxgran.dynamics.numba_engine.layout import ACTED, AT_STEP, CONTACTS
+    from jaxgran.dynamics.numba_engine.layout import (
+        RECORD_CONTACTS,
+        RECORD_SOLVED,
+        RECORD_STEP,
+    )
 
     records, count = call.records, call.recorded
     dtype = records.dtype
@@ -140,7 +144,9 @@ def _with_records(
                 user_sums, observe(flow, before, contacts, impulses), jnp.ones((), dtype)
             ), kicks
 
-        size = jnp.sum(record[CONTACTS] > jnp.asarray([0, *sizes[:-1]], dtype), dtype=jnp.int32)
+        size = jnp.sum(
+            record[RECORD_CONTACTS] > jnp.asarray([0, *sizes[:-1]], dtype), dtype=jnp.int32
+        )
         branches = [
             lambda: (user_sums, jnp.zeros_like(before.velocities)),
             *(partial(with_contacts, n) for n in sizes),
@@ -150,11 +156,11 @@ def _with_records(
             state.grains, before.positions, before.velocities + kicks, state.side, before.tilt
         )
         until = jnp.where(
-            k + 1 < count, records[jnp.minimum(k + 1, len(records) - 1), AT_STEP], flown
+            k + 1 < count, records[jnp.minimum(k + 1, len(records) - 1), RECORD_STEP], flown
         )
         # The step whose contacts have acted, in this record or an earlier one, is no step of the
         # flight.
-        weight = jnp.maximum(until - record[AT_STEP] - record[ACTED], 0)
+        weight = jnp.maximum(until - record[RECORD_STEP] - record[RECORD_SOLVED], 0)
         return added(sums, without_contacts(partial(observe, flow, after), dtype), weight)
 
     return lax.fori_loop(0, count, with_record, user_sums)
@@ -164,7 +170,7 @@ def _recorded_state(record: Array, state: State) -> State:
     """The state of a record, before its contacts act."""
     from jaxgran.dynamics.numba_engine import layout
 
-    tilt, count = record[layout.TILTED], state.grains.radii.size
+    tilt, count = record[layout.RECORD_TILT], state.grains.radii.size
     numbers = record[layout.RECORD_HEAD : layout.RECORD_HEAD + layout.RECORD_OF_GRAIN * count]
     motion = numbers.reshape(count, layout.RECORD_OF_GRAIN)
     return State(
@@ -180,7 +186,7 @@ def _recorded_contacts(record: Array, grains: Grains, slots: int) -> tuple[Conta
     rows = record[first : first + slots * layout.RECORD_OF_CONTACT].reshape(
         slots, layout.RECORD_OF_CONTACT
     )
-    used = jnp.arange(slots, dtype=record.dtype) < record[layout.CONTACTS]
+    used = jnp.arange(slots, dtype=record.dtype) < record[layout.RECORD_CONTACTS]
     rows = jnp.where(used[:, None], rows, 0)  # what was never written may be anything
     i, j = rows[:, 0].astype(jnp.int32), rows[:, 1].astype(jnp.int32)
     contacts = Contacts(

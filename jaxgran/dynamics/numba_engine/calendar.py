@@ -13,16 +13,16 @@ import numpy as np
 
 from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit, njit
 from jaxgran.dynamics.numba_engine.layout import (
-    ACROSS,
     BEGINS,
     ENDS,
     FIRST,
+    IMAGE_ROW,
+    IMAGE_X,
     LANES,
     LEAST_SHIFT,
     MANY,
     NEVER,
     RADIUS,
-    ROW,
     SECOND,
     STRIKES,
     VX,
@@ -47,9 +47,9 @@ def pair_motion(p, t, flow, grains, pairs):
     """
     motion, images = grains.motion, pairs.images
     i, j = pairs.ends[FIRST, p], pairs.ends[SECOND, p]
-    up = images[ROW, p] * flow.side
-    ux, uy = motion[i, VX] - motion[j, VX] - flow.rate * up, motion[i, VY] - motion[j, VY]
-    dx = motion[i, X] - motion[j, X] - images[ACROSS, p] + ux * t
+    up = images[IMAGE_ROW, p] * flow.side
+    ux, uy = motion[i, VX] - motion[j, VX] - flow.shear_rate * up, motion[i, VY] - motion[j, VY]
+    dx = motion[i, X] - motion[j, X] - images[IMAGE_X, p] + ux * t
     dy = motion[i, Y] - motion[j, Y] - up + uy * t
     return i, j, dx, dy, ux, uy
 
@@ -97,7 +97,7 @@ def predict_contact_steps(count, t, earliest, horizon, shift, flow, grains, pair
 @inline_njit
 def _contact_steps(dx, dy, ux, uy, reach, t, earliest, horizon, flow):
     """The entries of the calendar of a pair."""
-    dt, theta = flow.dt, flow.theta
+    dt, theta = flow.timestep, flow.activation_fraction
     speed, closing, excess = gap_coefficients(dx, dy, ux, uy, reach)
     discriminant = gap_discriminant(speed, closing, excess)
     root, per_speed = math.sqrt(discriminant if discriminant > 0.0 else 0.0), 1 / speed

@@ -30,11 +30,16 @@ import numba
 from llvmlite import binding as llvm
 from numba import types
 
-from jaxgran.dynamics.numba_engine.allocation import arrays_of, doubles_at, integers_at
+from jaxgran.dynamics.numba_engine.allocation import (
+    arrays_of,
+    doubles_at,
+    inputs_at,
+    integers_at,
+)
 from jaxgran.dynamics.numba_engine.compilation import OPTIONS, inline_njit
 from jaxgran.dynamics.numba_engine.layout import (
     CAPACITY,
-    INPUTS,
+    INPUT_NUMBERS,
     RESULTS,
     STATUS,
     WORDS,
@@ -207,7 +212,7 @@ def _handler(frame, replica, stop):
         doubles_at(_data(args, 1, replica, 2 * grains), (grains, 2)),
         doubles_at(_data(args, 2, replica, grains), (grains,)),
         doubles_at(_data(args, 3, replica, grains), (grains,)),
-        doubles_at(_data(args, 4, replica, INPUTS), (INPUTS,)),
+        inputs_at(_data(args, 4, replica, INPUT_NUMBERS), (1,))[0],
         doubles_at(_data(args, 5, replica, blocks), (blocks,)),
         doubles_at(_data(rets, 0, replica, 2 * grains), (grains, 2)),
         doubles_at(_data(rets, 1, replica, 2 * grains), (grains, 2)),

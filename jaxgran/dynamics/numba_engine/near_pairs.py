@@ -6,14 +6,11 @@ import numpy as np
 
 from jaxgran.dynamics.numba_engine.compilation import inline_njit, njit
 from jaxgran.dynamics.numba_engine.layout import (
-    ACROSS,
     FIRST,
-    INVERSE_MASS,
+    IMAGE_ROW,
+    IMAGE_X,
     RADIUS,
-    ROW,
     SECOND,
-    VX,
-    VY,
     X,
     Y,
 )
@@ -21,57 +18,14 @@ from jaxgran.dynamics.numba_engine.layout import (
 # strain: the longest life of a list, in which a peculiar speed grows by a factor of 1.1 at most
 LIFE = 0.1
 _ATTEMPTS = 12  # with ever narrower skins, while a list has more pairs than room
-_CACHED_GRAINS, _ROW_HEIGHT = 2000, 2.0  # larger flows are put in order, in cells of two diameters
 
 
 @inline_njit
-def skin_loss(fastest, rate, distance):
-    """The rate at which a list may lose its skin, for pairs within a distance."""
-    return 2 * fastest * (1 + LIFE) + rate * distance / 2
-
-
-@njit
-def put_in_order(positions, side, tilt, order):
-    """Write an order of the grains, row by row, that keeps neighbours close in memory if a flow
-    outgrows the caches.
+def closing_speed_bound(max_speed, shear_rate, distance):
+    """Bound on how fast the gap of a pair within a distance closes while a list is valid, see
+    ``dynamics.step``.
     """
-    given, cells, starts, count = order.given, order.cells, order.starts, order.given.size
-    across = (
-        int(max(1.0, min(math.sqrt(count), side / _ROW_HEIGHT))) if count > _CACHED_GRAINS else 1
-    )
-    for c in range(across * across + 1):
-        starts[c] = 0
-    for g in range(count):
-        cells[g] = 0
-        if across > 1 and abs(positions[g, 0]) < math.inf and abs(positions[g, 1]) < math.inf:
-            row = min(max(int(positions[g, 1] / side * across), 0), across - 1)
-            fraction = (positions[g, 0] - tilt * positions[g, 1]) / side
-            column = int((fraction - math.floor(fraction)) * across)
-            cells[g] = row * across + min(max(column, 0), across - 1)
-        starts[cells[g] + 1] += 1
-    for c in range(across * across):
-        starts[c + 1] += starts[c]
-    for g in range(count):
-        given[starts[cells[g]]] = g
-        starts[cells[g]] += 1
-
-
-@inline_njit
-def bring_into_cell(grains, side, tilt, rate):
-    """Bring the grains into the cell, at the same peculiar velocities; returns the largest peculiar
-    speed.
-    """
-    motion = grains.motion
-    fastest = 0.0
-    for g in range(motion.shape[0]):
-        cx, cy = motion[g, VX] - rate * motion[g, Y], motion[g, VY]
-        row = math.floor(motion[g, Y] / side)
-        motion[g, Y] -= row * side
-        motion[g, X] -= row * tilt * side
-        motion[g, X] -= math.floor((motion[g, X] - tilt * motion[g, Y]) / side) * side
-        motion[g, VX] = cx + rate * motion[g, Y]
-        fastest = max(fastest, cx * cx + cy * cy)
-    return math.sqrt(fastest)
+    return 2 * max_speed * (1 + LIFE) + shear_rate * distance / 2
 
 
 @njit
@@ -183,7 +137,7 @@ def _pairs_of_cells(pairs, side, tilt, up, along, skin, room):
                         min(found, room)
                     )  # without a branch, which would be mispredicted
                     ends[FIRST, at], ends[SECOND, at] = i, sorted_grains[n]
-                    images[ACROSS, at], images[ROW, at] = shift, lift
+                    images[IMAGE_X, at], images[IMAGE_ROW, at] = shift, lift
                     found += dx * dx + dy * dy <= limit * limit
     return found
 
@@ -203,7 +157,7 @@ def _pairs_of_all(grains, pairs, side, tilt, skin, room):
             if dx * dx + dy * dy <= limit * limit:
                 if found < room:
                     ends[FIRST, found], ends[SECOND, found] = i, j
-                    images[ACROSS, found], images[ROW, found] = shift, row
+                    images[IMAGE_X, found], images[IMAGE_ROW, found] = shift, row
                 found += 1
     return found
 
@@ -227,20 +181,3 @@ def _index_pairs(pairs, found):
     for g in range(offsets.size - 1, 0, -1):
         offsets[g] = offsets[g - 1]
     offsets[0] = 0
-
-
-@inline_njit
-def kinetic_sums(grains, rate):
-    """Σ m c_x c_x, Σ m c_x c_y and Σ m c_y c_y, just after a search."""
-    motion, constants = grains.motion, grains.constants
-    xx = xy = yy = 0.0
-    for g in range(motion.shape[0]):
-        cx, cy, mass = (
-            motion[g, VX] - rate * motion[g, Y],
-            motion[g, VY],
-            1 / constants[g, INVERSE_MASS],
-        )
-        xx += mass * cx * cx
-        xy += mass * cx * cy
-        yy += mass * cy * cy
-    return xx, xy, yy

@@ -15,12 +15,12 @@ _AMPLITUDES = 4 * len(WAVES)  # real and imaginary parts of both components
 
 
 @njit
-def read_velocity_scales(t, tilt, side, rate, grains, boxes, amplitudes, results):
+def read_velocity_scales(t, tilt, side, shear_rate, grains, boxes, amplitudes, results):
     """Add a reading of the state at the time t since the search, which stands for the time since
     the last reading.
 
     Args:
-      t, tilt, side, rate: the time, tilt and side of the cell then, and the shear rate.
+      t, tilt, side, shear_rate: the time, tilt and side of the cell then, and the shear shear_rate.
       grains: the grains.
       boxes: (grains, 3) memory for the mass and the momentum of each box.
       amplitudes: memory for ``_AMPLITUDES`` numbers.
@@ -36,7 +36,7 @@ def read_velocity_scales(t, tilt, side, rate, grains, boxes, amplitudes, results
     energy, total = 0.0, 0.0  # Σ m c² and Σ m
     for g in range(count):
         x, y = motion[g, X] + motion[g, VX] * t, motion[g, Y] + motion[g, VY] * t
-        cx, cy, mass = motion[g, VX] - rate * y, motion[g, VY], 1 / constants[g, INVERSE_MASS]
+        cx, cy, mass = motion[g, VX] - shear_rate * y, motion[g, VY], 1 / constants[g, INVERSE_MASS]
         sx, sy = (x - tilt * y) / side, y / side
         sx, sy = sx - math.floor(sx), sy - math.floor(sy)
         px, py = mass * cx, mass * cy
