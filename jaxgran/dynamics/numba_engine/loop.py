@@ -32,7 +32,7 @@ from jaxgran.dynamics.numba_engine.calendar import (
     predict_contact_steps,
 )
 from jaxgran.dynamics.numba_engine.collisions import collide, list_struck_pairs, strike
-from jaxgran.dynamics.numba_engine.compilation import njit
+from jaxgran.dynamics.numba_engine.compilation import CELL, njit
 from jaxgran.dynamics.numba_engine.layout import (
     BETWEEN_LISTS,
     CAPACITY,
@@ -61,7 +61,6 @@ from jaxgran.dynamics.numba_engine.motion import (
     move_grains,
     put_in_order,
     read_state,
-    wrapped,
     write_state,
 )
 from jaxgran.dynamics.numba_engine.near_pairs import LIFE, closing_speed_bound, search
@@ -70,6 +69,8 @@ from jaxgran.dynamics.numba_engine.sums import COLLISIONS, add_flight
 from jaxgran.dynamics.numba_engine.velocity_scales import read_velocity_scales
 from jaxgran.dynamics.tally import NUMBERS
 from jaxgran.dynamics.velocity_scales import READ_AFTER
+
+image_in_cell, remap_tilt = CELL["image_in_cell"], CELL["remap_tilt"]
 
 # Expected within the skin: wide lists cost the events, narrow ones the searches
 _PAIRS_PER_GRAIN = 2.7
@@ -305,8 +306,7 @@ def advance_loop(
             saved.kinetic_xx, saved.kinetic_xy, saved.kinetic_yy = kinetic
             break
         steps_before_list += k
-        tilt += shear_rate * k * dt
-        tilt -= math.floor(tilt + 0.5)
+        tilt = remap_tilt(tilt + shear_rate * k * dt)
         move_grains(k * dt, grains)
 
     if suspended > 0:
@@ -319,7 +319,7 @@ def advance_loop(
         write_state(order.in_state, side, tilt, shear_rate, grains, new_positions, new_velocities)
     else:  # as it was, to the bit
         for g in range(count):
-            new_positions[g, 0], new_positions[g, 1] = wrapped(
+            new_positions[g, 0], new_positions[g, 1] = image_in_cell(
                 positions[g, 0], positions[g, 1], side, tilt
             )
             new_velocities[g, 0], new_velocities[g, 1] = velocities[g, 0], velocities[g, 1]

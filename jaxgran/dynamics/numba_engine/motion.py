@@ -2,10 +2,10 @@
 
 import math
 
-import numpy as np
-
-from jaxgran.dynamics.numba_engine.compilation import inline_njit, njit
+from jaxgran.dynamics.numba_engine.compilation import CELL, inline_njit, njit
 from jaxgran.dynamics.numba_engine.layout import INVERSE_MASS, RADIUS, VX, VY, X, Y
+
+image_in_cell = CELL["image_in_cell"]
 
 _CACHED_GRAINS, _ROW_HEIGHT = 2000, 2.0  # larger flows are put in order, in cells of two diameters
 
@@ -102,19 +102,8 @@ def write_state(in_state, side, tilt, shear_rate, grains, new_positions, new_vel
     motion = grains.motion
     for g in range(in_state.size):
         n = in_state[g]
-        new_positions[n, 0], new_positions[n, 1] = wrapped(motion[g, X], motion[g, Y], side, tilt)
+        new_positions[n, 0], new_positions[n, 1] = image_in_cell(
+            motion[g, X], motion[g, Y], side, tilt
+        )
         new_velocities[n, 0] = motion[g, VX] - shear_rate * motion[g, Y]
         new_velocities[n, 1] = motion[g, VY]
-
-
-@inline_njit
-def wrapped(x, y, side, tilt):
-    """The image of a position that has x and y in [0, L), as by ``model.cell.wrap``.
-
-    Where XLA does this, its rounding depends on the program around it.
-    """
-    rows = np.floor(y / side)
-    rows = rows + 1.0 if y - rows * side >= side else rows
-    x, y = x - rows * tilt * side, y - rows * side
-    x = x - side * np.floor(x / side)
-    return 0.0 if x >= side else x, 0.0 if y < 0.0 else y

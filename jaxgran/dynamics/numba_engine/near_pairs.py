@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.numba_engine.compilation import inline_njit, njit
+from jaxgran.dynamics.numba_engine.compilation import CELL, inline_njit, njit
 from jaxgran.dynamics.numba_engine.layout import (
     FIRST,
     IMAGE_ROW,
@@ -14,6 +14,8 @@ from jaxgran.dynamics.numba_engine.layout import (
     X,
     Y,
 )
+
+nearest_image = CELL["nearest_image"]
 
 # strain: the longest life of a list, in which a peculiar speed grows by a factor of 1.1 at most
 LIFE = 0.1
@@ -150,8 +152,8 @@ def _pairs_of_all(grains, pairs, side, tilt, skin, room):
     for i in range(motion.shape[0]):
         for j in range(i):
             dx, dy = motion[i, X] - motion[j, X], motion[i, Y] - motion[j, Y]
-            row = int(np.rint(dy / side))
-            shift = np.rint((dx - row * tilt * side) / side) * side + row * tilt * side
+            column, row = nearest_image(dx, dy, side, tilt)
+            shift = column * side + row * tilt * side
             dx, dy = dx - shift, dy - row * side
             limit = constants[i, RADIUS] + constants[j, RADIUS] + skin
             if dx * dx + dy * dy <= limit * limit:

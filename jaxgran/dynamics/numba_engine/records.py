@@ -8,9 +8,7 @@ that continues with one, begin with a record without contacts. So every flight i
 the life of a list.
 """
 
-import math
-
-from jaxgran.dynamics.numba_engine.compilation import njit
+from jaxgran.dynamics.numba_engine.compilation import CELL, njit
 from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     DISTANCE,
@@ -32,6 +30,8 @@ from jaxgran.dynamics.numba_engine.layout import (
     Y,
 )
 
+remap_tilt = CELL["remap_tilt"]
+
 
 @njit
 def record_flight(record, step, solved, tilt, t, shear_rate, grains, in_state):
@@ -40,7 +40,7 @@ def record_flight(record, step, solved, tilt, t, shear_rate, grains, in_state):
     """
     motion = grains.motion
     record[RECORD_STEP], record[RECORD_SOLVED], record[RECORD_CONTACTS] = step, solved, 0.0
-    record[RECORD_TILT] = tilt - math.floor(tilt + 0.5)
+    record[RECORD_TILT] = remap_tilt(tilt)
     for g in range(in_state.size):
         at = RECORD_HEAD + RECORD_OF_GRAIN * in_state[g]
         y = motion[g, Y] + motion[g, VY] * t

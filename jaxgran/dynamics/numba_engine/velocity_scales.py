@@ -4,10 +4,12 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.numba_engine.compilation import njit
+from jaxgran.dynamics.numba_engine.compilation import CELL, njit
 from jaxgran.dynamics.numba_engine.layout import INVERSE_MASS, VX, VY, X, Y
 from jaxgran.dynamics.tally import place_of
 from jaxgran.dynamics.velocity_scales import BOX_GRAINS, WAVES
+
+remap_tilt = CELL["remap_tilt"]
 
 _DURATION, _READ_UNTIL = place_of("duration"), place_of("read_until")
 _LOCAL, _WAVE = place_of("local_kinetic"), place_of("wave_kinetic")
@@ -28,7 +30,7 @@ def read_velocity_scales(t, tilt, side, shear_rate, grains, boxes, amplitudes, r
     """
     motion, constants, count = grains.motion, grains.constants, grains.motion.shape[0]
     across = max(1, int(np.rint(math.sqrt(count / BOX_GRAINS))))
-    tilt -= math.floor(tilt + 0.5)
+    tilt = remap_tilt(tilt)
     for box in range(across * across):
         boxes[box, 0] = boxes[box, 1] = boxes[box, 2] = 0.0
     for n in range(_AMPLITUDES):
