@@ -164,9 +164,8 @@ def _register(cls: type) -> None:
         return leaves, tuple(getattr(solver, name) for name in names(True))
 
     def unflatten(static: tuple, leaves: Any) -> Any:
-        solver = object.__new__(
-            cls
-        )  # without checks: JAX also passes axis numbers and placeholders
+        # without checks: JAX also passes axis numbers and placeholders
+        solver = object.__new__(cls)
         for name, value in zip([*names(True), *names(False)], (*static, *leaves), strict=True):
             object.__setattr__(solver, name, value)
         return solver
@@ -305,9 +304,8 @@ class Jacobi(ProjectedMethod):
 
 
 DEFAULT_SOLVER = BarzilaiBorwein()
-SOLVERS: dict[
-    SolverName, type[ProjectedMethod]
-] = {  # by their names on the command line and in files
+# By their names on the command line and in files
+SOLVERS: dict[SolverName, type[ProjectedMethod]] = {
     "barzilai-borwein": BarzilaiBorwein,
     "nesterov": Nesterov,
     "jacobi": Jacobi,

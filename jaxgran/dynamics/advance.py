@@ -273,7 +273,7 @@ def call_numba(
         (room, layout.record_numbers(flow.grains)),
     ]
     results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
-    aliases = None if memory is None else {6: 3}
+    aliases = None if memory is None else {layout.MEMORY_GIVEN: layout.MEMORY}
     call = jax.ffi.ffi_call(
         TARGET, results, vmap_method="broadcast_all", input_output_aliases=aliases
     )

@@ -11,6 +11,10 @@ import numpy as np
 from jaxgran.dynamics.tally import NUMBERS
 from jaxgran.model.status import Status
 
+# Buffers of a call: what it is given, and what it returns
+POSITIONS, VELOCITIES, RADII, MASSES, NUMBERS_GIVEN, STEPS, MEMORY_GIVEN = range(7)
+NEW_POSITIONS, NEW_VELOCITIES, BLOCKS, MEMORY, RECORDS = range(5)
+
 
 class Inputs(NamedTuple):
     """Numbers of an advance, passed as one row of doubles in this order.
@@ -77,9 +81,12 @@ MU_NX, MU_NY, MU_U, INVERSE_MU, INVERSE_MU_MI, INVERSE_MU_MJ, P = range(7)
 # Columns of a contact in the method of Barzilai and Borwein: W p, the last changes of p and of W p,
 # p of the best iterate, and the diagonal D
 RESPONSE, STEP, RESPONSE_CHANGE, BEST, BOUND = range(5)
-# Columns of a record; behind them its grains and contacts, with so many numbers each
+# Columns of a record; behind this head its grains, then its contacts
 RECORD_STEP, RECORD_SOLVED, RECORD_CONTACTS, RECORD_TILT, RECORD_HEAD = range(5)
-RECORD_OF_GRAIN, RECORD_OF_CONTACT = 4, 7
+# Columns of a recorded grain and of a recorded contact, and how many these are
+RECORD_X, RECORD_Y, RECORD_CX, RECORD_CY, RECORD_OF_GRAIN = range(5)
+RECORD_I, RECORD_J, RECORD_NX, RECORD_NY, RECORD_APPROACH, RECORD_DISTANCE = range(6)
+RECORD_IMPULSE, RECORD_OF_CONTACT = 6, 7
 
 NEVER = np.int32(2**31 - 1)  # a step of the calendar that does not come
 MANY = 2.0**30  # steps, the end of the calendar
