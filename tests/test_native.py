@@ -17,7 +17,7 @@ from jaxgran.dynamics import advance as advance_module
 from jaxgran.dynamics.engine import Jax, Numba
 from jaxgran.dynamics.numba_engine import cluster_solver, layout
 from jaxgran.dynamics.numba_engine.ffi import object_file
-from jaxgran.dynamics.numba_engine.near_pairs import LIFE, find_near_pairs, skin_loss
+from jaxgran.dynamics.numba_engine.near_pairs import LIFE, closing_speed_bound, find_near_pairs
 from jaxgran.dynamics.tally import TABLE
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
@@ -262,7 +262,7 @@ def test_no_pair_closes_by_more_than_its_list_loses_of_the_skin(
     velocity = fastest * np.array([ci - cj, si - sj]) + [shear_rate * apart[1], 0]
     time = strain / shear_rate
     closed = distance - np.linalg.norm(apart + velocity * time)
-    assert closed <= skin_loss.py_func(fastest, shear_rate, distance) * time * (1 + 1e-12)
+    assert closed <= closing_speed_bound.py_func(fastest, shear_rate, distance) * time * (1 + 1e-12)
 
 
 @pytest.fixture(scope="module")

@@ -53,7 +53,7 @@ def test_any_change_of_any_source_gives_the_machine_code_another_file(of_copy: P
     compiled_here = {*(of_copy / "jaxgran" / "dynamics" / "numba_engine").glob("*.py")}
     imported = {
         of_copy / "jaxgran" / name
-        for name in ("contact/law.py", "model/status.py", "dynamics/tally.py")
+        for name in ("contact/law.py", "model/cell.py", "model/status.py", "dynamics/tally.py")
     }
     assert compiled_here and compiled_here | imported <= set(sources)
 

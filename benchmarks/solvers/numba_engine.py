@@ -10,7 +10,7 @@ from numba import njit
 from benchmarks.collection import Entry
 from benchmarks.collection.compare import CAP, Answer, Solve
 from jaxgran.dynamics.numba_engine.allocation import arrays_of
-from jaxgran.dynamics.numba_engine.cluster_solver import solve_cluster
+from jaxgran.dynamics.numba_engine.collisions import residual_target, solve_network
 from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     EPSILON,
@@ -20,13 +20,10 @@ from jaxgran.dynamics.numba_engine.layout import (
     INVERSE_MASS,
     NX,
     NY,
-    OK,
     SECOND,
     WORDS,
     WORDS_PER_GRAIN,
 )
-from jaxgran.dynamics.numba_engine.loop import residual_target
-from jaxgran.dynamics.numba_engine.network import find_clusters, solve_isolated
 
 
 def by_cluster(entry: Entry, tolerance: float) -> Solve:
@@ -40,45 +37,37 @@ def by_cluster(entry: Entry, tolerance: float) -> Solve:
 
     def solve() -> Answer | None:
         impulses, memory = np.empty_like(problem.approach), np.array([block.ctypes.data])
-        iterations, outcome = _solve(
+        iterations, status = _solve(
             memory, ends, normals, inverse_masses, problem.approach, impulses, float(tolerance), CAP
         )
-        return None if outcome == INFEASIBLE else Answer(impulses, iterations)
+        return None if status == INFEASIBLE else Answer(impulses, iterations)
 
     return solve
 
 
 @njit(error_model="numpy")
-def _solve(memory, ends, normals, inverse_masses, approach, impulses, tolerance, most_iterations):
-    """As ``_collide`` of the engine, for a given network."""
+def _solve(memory, ends, normals, inverse_masses, approach, impulses, tolerance, max_steps):
+    """As ``collide`` of the engine, for a given network."""
     count, contacts = inverse_masses.size, approach.size
     arrays, _ = arrays_of(memory, count)
     grains, network, clusters = arrays.grains, arrays.network, arrays.clusters
     for g in range(count):
         grains.constants[g, INVERSE_MASS] = inverse_masses[g]
-    scale, hits = 0.0, 0
+    scale, touched_count = 0.0, 0
     for c in range(contacts):
         for end in (FIRST, SECOND):
             g = network.ends[end, c] = ends[end, c]
             if network.degree[g] == 0:
-                network.touched[hits] = g
-                hits += 1
+                network.touched[touched_count] = g
+                touched_count += 1
             network.degree[g] += 1
         network.rows[NX, c], network.rows[NY, c] = normals[0, c], normals[1, c]
         network.rows[APPROACH, c], network.rows[IMPULSE, c] = approach[c], 0.0
         scale += min(approach[c], 0.0) ** 2
     target = residual_target(math.sqrt(scale), tolerance, 1.0, EPSILON)
-    iterations, spare, outcome = 1, target * target, OK
-    if solve_isolated(contacts, grains, network) > 0:
-        found = find_clusters(contacts, hits, network, clusters)
-        starts = clusters.starts
-        for m in range(found):
-            share = spare * (starts[m + 1] - starts[m]) / (starts[found] - starts[m])
-            needed, left, missed = solve_cluster(
-                m, share, most_iterations, grains, network, clusters
-            )
-            iterations, outcome = max(iterations, needed), max(outcome, missed)
-            spare -= left if left < share else share
+    iterations, _, status = solve_network(
+        contacts, touched_count, target, max_steps, grains, network, clusters
+    )
     for c in range(contacts):
         impulses[c] = network.rows[IMPULSE, c]
-    return iterations, outcome
+    return iterations, status

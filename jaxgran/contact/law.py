@@ -19,14 +19,12 @@ from jaxgran.model.status import DEEP_OVERLAP
 
 Number = Any  # a number, or an array of them
 
-LONGEST_STRIDE = (
-    1e4  # step length of the method of Barzilai and Borwein, in units of that of Nesterov's
-)
+# Step length of the method of Barzilai and Borwein, in units of that of Nesterov's
+LONGEST_STRIDE = 1e4
 WINDOW = 100  # iterations after which the progress of that method is judged
 PROGRESS = 0.5  # factor by which the best residual must have fallen within a window
-JAMMED_RESPONSE = (
-    1e-2  # pᵀWp over −pᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
-)
+# pᵀWp over −pᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
+JAMMED_RESPONSE = 1e-2
 ABSOLUTE_RESIDUAL = 10  # roundings of the velocity γ̇σ that a residual may always keep
 
 
@@ -166,9 +164,8 @@ def contact_terms(
         approaching: 1 where it is a contact, carries an impulse, approaches; otherwise 0.
     """
     xx, xy, yy = nx * nx * distance, nx * ny * distance, ny * ny * distance
-    binary_speed = (
-        -binary_impulse * approach
-    )  # the impulse is zero where the contact does not approach
+    # The impulse is zero where the contact does not approach
+    binary_speed = -binary_impulse * approach
     return (
         impulse,
         binary_impulse,

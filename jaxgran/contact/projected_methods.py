@@ -164,9 +164,8 @@ def _register(cls: type) -> None:
         return leaves, tuple(getattr(solver, name) for name in names(True))
 
     def unflatten(static: tuple, leaves: Any) -> Any:
-        solver = object.__new__(
-            cls
-        )  # without checks: JAX also passes axis numbers and placeholders
+        # without checks: JAX also passes axis numbers and placeholders
+        solver = object.__new__(cls)
         for name, value in zip([*names(True), *names(False)], (*static, *leaves), strict=True):
             object.__setattr__(solver, name, value)
         return solver
@@ -175,6 +174,21 @@ def _register(cls: type) -> None:
 
 
 _register(ProjectedMethod)
+
+
+class _GuardedSteps(NamedTuple):
+    """What ``BarzilaiBorwein`` remembers.
+
+    stride: step length τ.
+    guarded: 1 where Nesterov's method has taken over, otherwise 0.
+    k: steps of Nesterov's method since its last restart.
+    last_residual: the best residual at the end of the last window.
+    """
+
+    stride: Any
+    guarded: Any
+    k: Any
+    last_residual: Any
 
 
 @dataclass(frozen=True)
@@ -190,31 +204,27 @@ class BarzilaiBorwein(ProjectedMethod):
       BarzilaiBorwein(tolerance=1e-06, max_steps=5000)
     """
 
-    def init(self, approach: Array) -> Any:
-        return (
-            1.0,
-            -1.0,
-            float("inf"),
-        )  # step length; momentum, negative until it is Nesterov's; residual a window ago
+    def init(self, approach: Array) -> _GuardedSteps:
+        return _GuardedSteps(stride=1.0, guarded=0.0, k=0.0, last_residual=float("inf"))
 
     def propose(self, now: Iterate) -> tuple[Array, Array]:
-        stride, k, _ = now.memory
-        momentum = jnp.maximum(k, 0)
-        return now.point + momentum / (momentum + 3) * (now.point - now.previous), stride
+        k = now.memory.k
+        return now.point + k / (k + 3) * (now.point - now.previous), now.memory.stride
 
     def learn(
         self, now: Iterate, start: Array, point: Array, bound: Array, best_residual: Array
-    ) -> Any:
-        _, k, last_residual = now.memory
+    ) -> _GuardedSteps:
+        _, was_guarded, k, last_residual = now.memory
         window_ends = now.iterations % WINDOW == WINDOW - 1
-        guarded = (k >= 0) | (window_ends & ~(best_residual < PROGRESS * last_residual))
+        stalled = window_ends & ~(best_residual < PROGRESS * last_residual)
+        guarded = (was_guarded > 0) | stalled
         step, response = point - now.point
-        is_long = now.iterations % 2 == 1
+        is_long = now.iterations % 2 == 1  # long and short steps in turn
         along_step = is_long | guarded
+        # One product for all cases: sᵀDs of a long step, (Ws)ᵀD⁻¹Ws of a short one, and the descent
+        # of a guarded one, which is positive where the step turns uphill
         scaled_step = bound * jnp.where(guarded, start[0] - point[0], step)
         scaled = jnp.where(along_step, scaled_step, response / bound)
-        # sᵀDs of the long step or (Ws)ᵀD⁻¹Ws of the short one; the descent along the step of
-        # Nesterov's method
         square = dot(scaled, jnp.where(along_step, step, response))
         curvature = dot(step, response)  # sᵀWs
         numerator = jnp.where(is_long, square, curvature)
@@ -222,11 +232,12 @@ class BarzilaiBorwein(ProjectedMethod):
         curved = denominator > 0
         quotient = numerator / jnp.where(curved, denominator, 1)
         stride = jnp.where(curved, jnp.minimum(quotient, LONGEST_STRIDE), LONGEST_STRIDE)
-        momentum = jnp.where(square > 0, 0, jnp.maximum(k, -1) + 1)
-        return (
-            jnp.where(guarded, 1, stride),
-            jnp.where(guarded, momentum, -1),
-            jnp.where(window_ends, best_residual, last_residual),
+        accelerates = (was_guarded > 0) & ~(square > 0)
+        return _GuardedSteps(
+            stride=jnp.where(guarded, 1, stride),
+            guarded=guarded,
+            k=jnp.where(accelerates, k + 1, 0),
+            last_residual=jnp.where(window_ends, best_residual, last_residual),
         )
 
 
@@ -293,9 +304,8 @@ class Jacobi(ProjectedMethod):
 
 
 DEFAULT_SOLVER = BarzilaiBorwein()
-SOLVERS: dict[
-    SolverName, type[ProjectedMethod]
-] = {  # by their names on the command line and in files
+# By their names on the command line and in files
+SOLVERS: dict[SolverName, type[ProjectedMethod]] = {
     "barzilai-borwein": BarzilaiBorwein,
     "nesterov": Nesterov,
     "jacobi": Jacobi,

@@ -38,10 +38,8 @@ from jaxgran.contact.projected_methods import Iterate, ProjectedMethod, dot
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.status import Status
 
-_DERIVATIVE_TOLERANCE, _WORST_DERIVATIVE = (
-    1e-12,
-    1e-6,
-)  # relative residuals; a derivative above the latter is NaN
+# Relative residuals; a derivative above the latter is NaN
+_DERIVATIVE_TOLERANCE, _WORST_DERIVATIVE = 1e-12, 1e-6
 _DERIVATIVE_ITERATIONS = 50  # at most, for each slot of a contact
 
 

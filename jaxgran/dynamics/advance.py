@@ -196,14 +196,13 @@ class NumbaCall(NamedTuple):
     field      shape            meaning
     =========  ===============  ====================================================================
     end        State            the state at the end, unless the call is suspended
-    sums       RunningSums      (blocks,) the running sums, with those of the calls that it goes on
-                                from
+    sums       RunningSums      (blocks,) the running sums, with those of the calls that it resumes
     kinetic    (blocks,)        kinetic energy at the end of each block but the last one
     drift      (blocks,)        relative momentum then
     suspended  ()               where the call is suspended; 0 if it is finished
     recorded   ()               number of records
     records    (room, numbers)  see ``numba_engine.records``
-    memory     (words,)         memory of the engine, in which another call goes on; (0,) without
+    memory     (words,)         memory of the engine, from which another call resumes; (0,) without
                                 records
     =========  ===============  ====================================================================
     """
@@ -248,52 +247,48 @@ def call_numba(
       steps: (blocks,) numbers of time steps.
       room: number of records, static, for one block. The call is suspended where there is no room
         for more; 0 records nothing.
-      suspended, memory: those of an earlier call with the same arguments, where it is to go on; 0
-        to begin.
+      suspended, memory: those of an earlier call with the same arguments, to resume it; 0 to begin.
     """
     from jaxgran.dynamics.numba_engine import layout
     from jaxgran.dynamics.numba_engine.ffi import TARGET
 
     register_numba()
-    dtype, grains, count = state.positions.dtype, state.grains, flow.grains
-    numbers = (
-        state.side,
-        state.tilt,
-        flow.restitution,
-        flow.timestep,
-        flow.shear_rate,
-        solver.tolerance,
+    dtype, grains = state.positions.dtype, state.grains
+    inputs = layout.Inputs(
+        side=state.side,
+        tilt=state.tilt,
+        restitution=flow.restitution,
+        timestep=flow.timestep,
+        shear_rate=flow.shear_rate,
+        tolerance=solver.tolerance,
+        activation=flow.activation,
+        max_steps=solver.max_steps,
+        resume_at=suspended,
     )
-    numbers = (*numbers, flow.activation, solver.max_steps, suspended)
-    record = layout.record_numbers(count)
-    kept = numba_memory(flow).shape if room > 0 else (0,)  # without records nothing goes on in it
     shapes = [
         state.positions.shape,
         state.positions.shape,
         (*steps.shape, layout.RESULTS),
-        kept,
-        (room, record),
+        numba_memory(flow).shape if room > 0 else (0,),  # without records no call is resumed
+        (room, layout.record_numbers(flow.grains)),
     ]
     results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
-    aliases = None if memory is None else {6: 3}
+    aliases = None if memory is None else {layout.MEMORY_GIVEN: layout.MEMORY}
     call = jax.ffi.ffi_call(
         TARGET, results, vmap_method="broadcast_all", input_output_aliases=aliases
     )
-    packed = jnp.stack([jnp.asarray(x).astype(dtype) for x in numbers])
-    given = (
+    positions, velocities, blocks, memory, records = call(
         state.positions,
         state.velocities,
         grains.radii,
         grains.masses,
-        packed,
+        jnp.stack([jnp.asarray(x).astype(dtype) for x in inputs]),
         steps.astype(dtype),
+        *(() if memory is None else (memory,)),
     )
-    positions, velocities, found, memory, records = call(
-        *given, *(() if memory is None else (memory,))
-    )
-    last = found[-1]
+    last = blocks[-1]
     end = State(grains, positions, velocities, state.side, last[layout.TILT])
-    sums = jax.vmap(sums_from_row)(found[:, :NUMBERS], found[:, layout.STATUS].astype(jnp.int32))
+    sums = jax.vmap(sums_from_row)(blocks[:, :NUMBERS], blocks[:, layout.STATUS].astype(jnp.int32))
     recorded = last[layout.RECORDED].astype(jnp.int32)
-    kinetic, drift = found[:, layout.KINETIC], found[:, layout.DRIFT]
+    kinetic, drift = blocks[:, layout.KINETIC], blocks[:, layout.DRIFT]
     return NumbaCall(end, sums, kinetic, drift, last[layout.SUSPENDED], recorded, records, memory)

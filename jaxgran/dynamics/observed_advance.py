@@ -122,7 +122,7 @@ def _with_records(
     flow: ShearFlow, state: State, observe: Observe, user_sums: Any, call: NumbaCall, flown: Array
 ) -> Any:
     """The user sums with what is found in the records of a call, up to the step ``flown``."""
-    from jaxgran.dynamics.numba_engine.layout import ACTED, AT_STEP, CONTACTS
+    from jaxgran.dynamics.numba_engine import layout
 
     records, count = call.records, call.recorded
     dtype = records.dtype
@@ -140,7 +140,9 @@ def _with_records(
                 user_sums, observe(flow, before, contacts, impulses), jnp.ones((), dtype)
             ), kicks
 
-        size = jnp.sum(record[CONTACTS] > jnp.asarray([0, *sizes[:-1]], dtype), dtype=jnp.int32)
+        size = jnp.sum(
+            record[layout.RECORD_CONTACTS] > jnp.asarray([0, *sizes[:-1]], dtype), dtype=jnp.int32
+        )
         branches = [
             lambda: (user_sums, jnp.zeros_like(before.velocities)),
             *(partial(with_contacts, n) for n in sizes),
@@ -150,11 +152,11 @@ def _with_records(
             state.grains, before.positions, before.velocities + kicks, state.side, before.tilt
         )
         until = jnp.where(
-            k + 1 < count, records[jnp.minimum(k + 1, len(records) - 1), AT_STEP], flown
+            k + 1 < count, records[jnp.minimum(k + 1, len(records) - 1), layout.RECORD_STEP], flown
         )
         # The step whose contacts have acted, in this record or an earlier one, is no step of the
         # flight.
-        weight = jnp.maximum(until - record[AT_STEP] - record[ACTED], 0)
+        weight = jnp.maximum(until - record[layout.RECORD_STEP] - record[layout.RECORD_SOLVED], 0)
         return added(sums, without_contacts(partial(observe, flow, after), dtype), weight)
 
     return lax.fori_loop(0, count, with_record, user_sums)
@@ -164,12 +166,11 @@ def _recorded_state(record: Array, state: State) -> State:
     """The state of a record, before its contacts act."""
     from jaxgran.dynamics.numba_engine import layout
 
-    tilt, count = record[layout.TILTED], state.grains.radii.size
+    tilt, count = record[layout.RECORD_TILT], state.grains.radii.size
     numbers = record[layout.RECORD_HEAD : layout.RECORD_HEAD + layout.RECORD_OF_GRAIN * count]
     motion = numbers.reshape(count, layout.RECORD_OF_GRAIN)
-    return State(
-        state.grains, wrap(motion[:, :2], state.side, tilt), motion[:, 2:], state.side, tilt
-    )
+    positions = wrap(motion[:, layout.RECORD_X : layout.RECORD_CX], state.side, tilt)
+    return State(state.grains, positions, motion[:, layout.RECORD_CX :], state.side, tilt)
 
 
 def _recorded_contacts(record: Array, grains: Grains, slots: int) -> tuple[Contacts, Array]:
@@ -180,17 +181,18 @@ def _recorded_contacts(record: Array, grains: Grains, slots: int) -> tuple[Conta
     rows = record[first : first + slots * layout.RECORD_OF_CONTACT].reshape(
         slots, layout.RECORD_OF_CONTACT
     )
-    used = jnp.arange(slots, dtype=record.dtype) < record[layout.CONTACTS]
+    used = jnp.arange(slots, dtype=record.dtype) < record[layout.RECORD_CONTACTS]
     rows = jnp.where(used[:, None], rows, 0)  # what was never written may be anything
-    i, j = rows[:, 0].astype(jnp.int32), rows[:, 1].astype(jnp.int32)
+    i = rows[:, layout.RECORD_I].astype(jnp.int32)
+    j = rows[:, layout.RECORD_J].astype(jnp.int32)
     contacts = Contacts(
         i=i,
         j=j,
-        normals=rows[:, 2:4],
-        distances=jnp.where(used, rows[:, 5], 1),
-        approach=rows[:, 4],
+        normals=rows[:, layout.RECORD_NX : layout.RECORD_APPROACH],
+        distances=jnp.where(used, rows[:, layout.RECORD_DISTANCE], 1),
+        approach=rows[:, layout.RECORD_APPROACH],
         inverse_mass_i=jnp.where(used, 1 / grains.masses[i], 0),
         inverse_mass_j=jnp.where(used, 1 / grains.masses[j], 0),
         used=used,
     )
-    return contacts, rows[:, 6]
+    return contacts, rows[:, layout.RECORD_IMPULSE]

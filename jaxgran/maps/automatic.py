@@ -87,7 +87,7 @@ def _timestep_for(settings: MapSettings, error: float, strain: Any) -> tuple[flo
     """
     flows = stack_of_any_size(settings.flows())
     temperature = temperature_of(settings, flows)
-    longest = automatic_timestep(temperature, flows.packing_fraction, settings.activation, error)
+    longest = automatic_timestep(temperature, flows.packing_fraction, flows.activation, error)
     steps = (
         np.minimum(longest, strain / FEWEST_STEPS) if isinstance(strain, int | float) else longest
     )

@@ -3,13 +3,21 @@
 The lattice vectors are (L, 0) and (tilt·L, L). Adding an integer to the tilt gives the same
 lattice, so the tilt is kept in [−½, ½). Velocities are peculiar (SLLOD): all images of a grain have
 the same one. The velocity jump between images enters through γ̇ Δy of the separation.
+
+``remap_tilt``, ``nearest_image`` and ``image_in_cell`` take numbers or arrays: the numba engine
+compiles the same source (``dynamics.numba_engine.compilation``).
 """
+
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax.numpy import floor, rint, where
 from jaxtyping import Array, Float
 
 from jaxgran.model.indexing import taken
+
+Number = Any  # a number, or an array of them
 
 
 def cell_side(radii: Float[Array, " grains"], packing_fraction: float | Array) -> Float[Array, ""]:
@@ -23,14 +31,31 @@ def cell_side(radii: Float[Array, " grains"], packing_fraction: float | Array) -
     return jnp.sqrt(jnp.pi * jnp.sum(radii**2) / packing_fraction)
 
 
-def remap_tilt(tilt: Float[Array, ""]) -> Float[Array, ""]:
+def remap_tilt(tilt: Number) -> Number:
     """The same lattice with its tilt in [−½, ½).
 
     Examples:
       >>> float(remap_tilt(jnp.asarray(0.75)))
       -0.25
     """
-    return tilt - jnp.floor(tilt + 0.5)
+    return tilt - floor(tilt + 0.5)
+
+
+def nearest_image(dx: Number, dy: Number, side: Number, tilt: Number) -> tuple[Number, Number]:
+    """The whole numbers of columns and rows, lattice vectors (L, 0) and (tilt·L, L), to subtract
+    from a separation for the minimum image.
+    """
+    rows = rint(dy / side)
+    return rint((dx - rows * tilt * side) / side), rows
+
+
+def image_in_cell(x: Number, y: Number, side: Number, tilt: Number) -> tuple[Number, Number]:
+    """The image of a position that has x and y in [0, L)."""
+    rows = floor(y / side)
+    rows = where(y - rows * side >= side, rows + 1, rows)  # L plus a tiny negative y rounds to L
+    x_of_row, y_of_row = x - rows * tilt * side, y - rows * side
+    x_of_cell = x_of_row - side * floor(x_of_row / side)
+    return where(x_of_cell >= side, 0.0, x_of_cell), where(y_of_row < 0, 0.0, y_of_row)
 
 
 def displacement(
@@ -46,21 +71,14 @@ def displacement(
       [-2.5, -1.0]
     """
     d = to - origin
-    rows = jnp.round(d[..., 1] / side)
-    x = d[..., 0] - rows * tilt * side
-    return jnp.stack([x - side * jnp.round(x / side), d[..., 1] - rows * side], axis=-1)
+    dx, dy = d[..., 0], d[..., 1]
+    columns, rows = nearest_image(dx, dy, side, tilt)
+    return jnp.stack([dx - rows * tilt * side - side * columns, dy - rows * side], axis=-1)
 
 
 def wrap(positions: Float[Array, "grains 2"], side: Array, tilt: Array) -> Float[Array, "grains 2"]:
     """The images of the positions that have x and y in [0, L)."""
-    x, y = positions[:, 0], positions[:, 1]
-    rows = jnp.floor(y / side)
-    rows = jnp.where(
-        y - rows * side >= side, rows + 1, rows
-    )  # L plus a tiny negative y rounds to L
-    x = x - rows * tilt * side
-    x = x - side * jnp.floor(x / side)
-    return jnp.stack([jnp.where(x >= side, 0, x), jnp.maximum(y - rows * side, 0)], axis=-1)
+    return jnp.stack(image_in_cell(positions[:, 0], positions[:, 1], side, tilt), axis=-1)
 
 
 def sheared(vectors: Float[Array, "*n 2"], strain: Array) -> Float[Array, "*n 2"]:

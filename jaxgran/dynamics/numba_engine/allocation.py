@@ -10,16 +10,18 @@ engine needs no runtime of numba. That is why an intrinsic makes the arrays, by
 
 from typing import Any, NamedTuple
 
-from numba import types
+from numba import from_dtype, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
 from jaxgran.dynamics.numba_engine.compilation import inline_njit
 from jaxgran.dynamics.numba_engine.layout import (
+    INPUTS,
     LANES,
     LEAST_SHIFT,
     SAVED,
+    SAVED_NUMBERS,
     WORDS,
     WORDS_PER_GRAIN,
     Clusters,
@@ -30,12 +32,12 @@ from jaxgran.dynamics.numba_engine.layout import (
 )
 from jaxgran.dynamics.tally import NUMBERS
 
-_PAIR_CAPACITY = 16  # slots of pairs for each grain
+_PAIRS_PER_GRAIN = 16  # capacity
 
 
 class Arrays(NamedTuple):
-    """All arrays of the time loop: see ``layout``; step_sums: (NUMBERS,); saved: (NUMBERS +
-    SAVED,), see ``loop``.
+    """All arrays of the time loop: see ``layout``; step_sums and saved_sums: (NUMBERS,);
+    saved_numbers: (1,) of ``SAVED``.
     """
 
     grains: Any
@@ -44,7 +46,8 @@ class Arrays(NamedTuple):
     clusters: Any
     order: Any
     step_sums: Any
-    saved: Any
+    saved_sums: Any
+    saved_numbers: Any
 
 
 def _array_of(kind: types.Type) -> Any:
@@ -73,6 +76,7 @@ def _array_of(kind: types.Type) -> Any:
 
 
 integers_at, doubles_at = _array_of(types.int64), _array_of(types.float64)
+inputs_at, _saved_at = _array_of(from_dtype(INPUTS)), _array_of(from_dtype(SAVED))
 _signed_at, _unsigned_at = _array_of(types.int32), _array_of(types.uint32)
 
 
@@ -88,15 +92,15 @@ def _reserve(memory, count, size):
 
 @inline_njit
 def _pairs_of(memory, count):
-    room = min(_PAIR_CAPACITY * count, count * (count - 1) // 2)
-    slots, cells = (room + LANES) // LANES * LANES, max(9, 2 * count)
+    capacity = min(_PAIRS_PER_GRAIN * count, count * (count - 1) // 2)
+    slots, cells = (capacity + LANES) // LANES * LANES, max(9, 2 * count)
     bounds = (slots >> LEAST_SHIFT) + LANES  # padded to whole rows
     return Pairs(
         _unsigned_at(_reserve(memory, 2 * slots, 4), (2, slots)),
         doubles_at(_reserve(memory, 2 * slots, 8), (2, slots)),
         _signed_at(_reserve(memory, 3 * slots, 4), (3, slots)),
         _signed_at(_reserve(memory, 2 * bounds, 4), (2, bounds)),
-        _unsigned_at(_reserve(memory, 2 * room, 4), (2 * room,)),
+        _unsigned_at(_reserve(memory, 2 * capacity, 4), (2 * capacity,)),
         _unsigned_at(_reserve(memory, count + 1, 4), (count + 1,)),
         _unsigned_at(_reserve(memory, cells + 1, 4), (cells + 1,)),
         _unsigned_at(_reserve(memory, count, 4), (count,)),
@@ -154,17 +158,20 @@ def arrays_of(memory, count):
     motion, constants = _reserve(memory, 4 * count, 8), _reserve(memory, 2 * count, 8)
     grains = Grains(doubles_at(motion, (count, 4)), doubles_at(constants, (count, 2)))
     pairs, network = _pairs_of(memory, count), _network_of(memory, count)
-    clusters = _clusters_of(memory, count, network.kicks)  # the kicks are gathered after the solves
+    clusters = _clusters_of(memory, count, network.impulses)  # summed after the solves
     order = Order(
         _unsigned_at(_reserve(memory, count, 4), (count,)),
         _unsigned_at(_reserve(memory, count, 4), (count,)),
         _unsigned_at(_reserve(memory, count + 2, 4), (count + 2,)),
     )
     step_sums = doubles_at(_reserve(memory, NUMBERS, 8), (NUMBERS,))
-    saved = doubles_at(_reserve(memory, NUMBERS + SAVED, 8), (NUMBERS + SAVED,))
+    saved_sums = doubles_at(_reserve(memory, NUMBERS, 8), (NUMBERS,))
+    saved_numbers = _saved_at(_reserve(memory, SAVED_NUMBERS, 8), (1,))
     fits = memory[0] <= end
     for g in range(count if fits else 0):
         network.degree[g] = network.loaded[g] = 0
-        network.kicks[g, 0] = network.kicks[g, 1] = 0.0
+        network.impulses[g, 0] = network.impulses[g, 1] = 0.0
         clusters.reached[g] = 0
-    return Arrays(grains, pairs, network, clusters, order, step_sums, saved), fits
+    return Arrays(
+        grains, pairs, network, clusters, order, step_sums, saved_sums, saved_numbers
+    ), fits

@@ -13,16 +13,16 @@ import numpy as np
 
 from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit, njit
 from jaxgran.dynamics.numba_engine.layout import (
-    ACROSS,
     BEGINS,
     ENDS,
     FIRST,
+    IMAGE_ROW,
+    IMAGE_X,
     LANES,
     LEAST_SHIFT,
     MANY,
     NEVER,
     RADIUS,
-    ROW,
     SECOND,
     STRIKES,
     VX,
@@ -47,9 +47,9 @@ def pair_motion(p, t, flow, grains, pairs):
     """
     motion, images = grains.motion, pairs.images
     i, j = pairs.ends[FIRST, p], pairs.ends[SECOND, p]
-    up = images[ROW, p] * flow.side
-    ux, uy = motion[i, VX] - motion[j, VX] - flow.rate * up, motion[i, VY] - motion[j, VY]
-    dx = motion[i, X] - motion[j, X] - images[ACROSS, p] + ux * t
+    up = images[IMAGE_ROW, p] * flow.side
+    ux, uy = motion[i, VX] - motion[j, VX] - flow.shear_rate * up, motion[i, VY] - motion[j, VY]
+    dx = motion[i, X] - motion[j, X] - images[IMAGE_X, p] + ux * t
     dy = motion[i, Y] - motion[j, Y] - up + uy * t
     return i, j, dx, dy, ux, uy
 
@@ -96,31 +96,35 @@ def predict_contact_steps(count, t, earliest, horizon, shift, flow, grains, pair
 
 @inline_njit
 def _contact_steps(dx, dy, ux, uy, reach, t, earliest, horizon, flow):
-    """The entries of the calendar of a pair."""
-    dt, theta = flow.dt, flow.theta
-    speed, closing, excess = gap_coefficients(dx, dy, ux, uy, reach)
-    discriminant = gap_discriminant(speed, closing, excess)
-    root, per_speed = math.sqrt(discriminant if discriminant > 0.0 else 0.0), 1 / speed
-    turn = _as_step(
-        first_step(t - closing * per_speed, dt, 0.0)
-    )  # the first step in which the pair recedes
-    enter = touching_time(closing, excess, root) if closing < 0.0 else -(root + closing) * per_speed
+    """The entries of the calendar of a pair: the step in which it strikes, and the first and last
+    step in which it is a contact.
+    """
+    dt, theta = flow.timestep, flow.activation
+    squared_speed, closing, excess = gap_coefficients(dx, dy, ux, uy, reach)
+    discriminant = gap_discriminant(squared_speed, closing, excess)
+    root = math.sqrt(discriminant if discriminant > 0.0 else 0.0)
+    per_squared_speed = 1 / squared_speed
+    recedes_from = _as_step(first_step(t - closing * per_squared_speed, dt, 0.0))
+    enter = (
+        touching_time(closing, excess, root)
+        if closing < 0.0
+        else -(root + closing) * per_squared_speed
+    )
     begin = _as_step(first_step(t + enter, dt, theta))
     begin = begin if begin > earliest else earliest
-    last = _as_step(np.floor((t + (root - closing) * per_speed) / dt - theta))
-    last = last if last > turn - 1 else turn - 1
-    late = (excess > 0.0) & (
-        excess + 2 * closing * horizon > 0.0
-    )  # the gap does not close while the list is valid
-    meets = (discriminant >= 0.0) & (begin <= last) & (begin < MANY) & (speed != 0.0)
-    rests = (speed == 0.0) & (excess <= 0.0)
-    begin = begin if meets else (earliest if rests else _NEVER)
-    last = last if meets else (_NEVER - 1 if rests else -1.0)
-    strikes = meets & (begin < turn) & (not late)
+    last = _as_step(np.floor((t + (root - closing) * per_squared_speed) / dt - theta))
+    last = last if last > recedes_from - 1 else recedes_from - 1
+    # the gap does not close while the list is valid
+    after_list = (excess > 0.0) & (excess + 2 * closing * horizon > 0.0)
+    touches = (discriminant >= 0.0) & (begin <= last) & (begin < MANY) & (squared_speed != 0.0)
+    in_contact = (squared_speed == 0.0) & (excess <= 0.0)
+    begin = begin if touches else (earliest if in_contact else _NEVER)
+    last = last if touches else (_NEVER - 1 if in_contact else -1.0)
+    strikes = touches & (begin < recedes_from) & (not after_list)
     return (
         np.int32(begin if strikes else _NEVER),
-        np.int32(_NEVER if late else begin),
-        np.int32(-1.0 if late else last),
+        np.int32(_NEVER if after_list else begin),
+        np.int32(-1.0 if after_list else last),
     )
 
 
@@ -132,17 +136,12 @@ def _as_step(number):
 
 
 @inline_njit
-def clear_calendar(found, pairs):
-    """Pad the calendar behind the pairs found to whole ``LANES``; returns the number of its
-    entries.
-    """
-    entries = (found + LANES - 1) // LANES * LANES
-    for p in range(found, entries):
-        pairs.calendar[STRIKES, p], pairs.calendar[BEGINS, p], pairs.calendar[ENDS, p] = (
-            NEVER,
-            NEVER,
-            -1,
-        )
+def clear_calendar(pair_count, pairs):
+    """Pad the calendar to whole ``LANES``; returns the number of its entries."""
+    entries = (pair_count + LANES - 1) // LANES * LANES
+    for p in range(pair_count, entries):
+        pairs.calendar[STRIKES, p] = pairs.calendar[BEGINS, p] = NEVER
+        pairs.calendar[ENDS, p] = -1
     return entries
 
 
@@ -224,10 +223,10 @@ def _next_by_blocks(entries, shift, pairs):
         if least == NEVER:
             return least
         for row in range(rows):
-            found = 0
+            matches = 0
             for b in range(row * _ROW, (row + 1) * _ROW):
-                found += bounds[STRIKES, b] == least
-            if found > 0:
+                matches += bounds[STRIKES, b] == least
+            if matches > 0:
                 for b in range(row * _ROW, (row + 1) * _ROW):
                     if bounds[STRIKES, b] == least:
                         first, size = _pairs_of_block(b, entries, shift)
@@ -240,13 +239,13 @@ def _next_by_blocks(entries, shift, pairs):
 
 
 @inline_njit
-def contacts_of_step(k, entries, shift, pairs, met):
+def contacts_of_step(k, entries, shift, pairs, near_pair):
     """Write the pairs that are contacts in a step; those beyond the room are counted, not written.
 
     After the step, the entries of those that approach are written anew.
     """
     if shift > 0:
-        return _contacts_by_blocks(k, entries, shift, pairs, met)
+        return _contacts_by_blocks(k, entries, shift, pairs, near_pair)
     calendar = pairs.calendar
     contacts, now = 0, np.int32(k)
     for lanes in range(entries // LANES):
@@ -254,12 +253,14 @@ def contacts_of_step(k, entries, shift, pairs, met):
         for p in range(lanes * LANES, (lanes + 1) * LANES):
             inside += (calendar[BEGINS, p] <= now) & (now <= calendar[ENDS, p])
         if inside > 0:
-            contacts = _contacts_among(np.uint64(lanes * LANES), LANES, now, contacts, pairs, met)
+            contacts = _contacts_among(
+                np.uint64(lanes * LANES), LANES, now, contacts, pairs, near_pair
+            )
     return contacts
 
 
 @inline_njit
-def _contacts_by_blocks(k, entries, shift, pairs, met):
+def _contacts_by_blocks(k, entries, shift, pairs, near_pair):
     """The same by the bounds of blocks, which become those of the steps after ``k`` in the blocks
     that have begun.
     """
@@ -274,7 +275,7 @@ def _contacts_by_blocks(k, entries, shift, pairs, met):
                 first, size = _pairs_of_block(b, entries, shift)
                 inside, bounds[STRIKES, b], bounds[BEGINS, b] = _after(now, first, size, calendar)
                 if inside > 0:
-                    contacts = _contacts_among(first, size, now, contacts, pairs, met)
+                    contacts = _contacts_among(first, size, now, contacts, pairs, near_pair)
     return contacts
 
 
@@ -294,7 +295,7 @@ def _after(now, first, size, calendar):
 
 
 @inline_njit
-def _contacts_among(first, size, now, contacts, pairs, met):
+def _contacts_among(first, size, now, contacts, pairs, near_pair):
     """Write the contacts among ``size`` pairs behind those found before; returns how many there are
     now.
     """
@@ -302,7 +303,7 @@ def _contacts_among(first, size, now, contacts, pairs, met):
     for n in range(size):
         p = first + np.uint64(n)
         if calendar[BEGINS, p] <= now and now <= calendar[ENDS, p]:
-            if contacts < met.size:
-                met[contacts] = p
+            if contacts < near_pair.size:
+                near_pair[contacts] = p
             contacts += 1
     return contacts

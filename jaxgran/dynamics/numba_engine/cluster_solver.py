@@ -19,7 +19,6 @@ from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     BEST,
     BOUND,
-    CHANGE,
     FIRST,
     IMPULSE,
     INFEASIBLE,
@@ -36,6 +35,7 @@ from jaxgran.dynamics.numba_engine.layout import (
     NY,
     OK,
     RESPONSE,
+    RESPONSE_CHANGE,
     SECOND,
     STEP,
     P,
@@ -53,47 +53,40 @@ _RELAXATION = np.minimum(1 + 0.075 * np.log2(np.maximum(np.arange(641), 1)), 1.7
 
 
 @inline_njit
-def solve_cluster(m, target, most_iterations, grains, network, clusters):
+def solve_cluster(m, target, max_steps, grains, network, clusters):
     """Write the impulses p₀ of cluster m at restitution zero.
 
     ``target`` is the squared residual to reach. Returns the iterations, the squared residual, and
     ok, iteration_limit, infeasible or nonfinite.
     """
-    rows, stiff, places, impulses = clusters.rows, clusters.stiff, clusters.places, network.rows
+    rows, iterate, places, impulses = clusters.rows, clusters.iterate, clusters.places, network.rows
     start = clusters.starts[m]
     size = np.uint64(clusters.starts[m + 1] - start)
     _take_contacts(start, size, grains, network, clusters)
-    iterations, squared = _sweep(size, target, min(most_iterations, SWEEPS), clusters)
-    outcome = OK if squared <= target else ITERATION_LIMIT
-    if outcome != OK:
+    iterations, squared_residual = _sweep(size, target, min(max_steps, SWEEPS), clusters)
+    status = OK if squared_residual <= target else ITERATION_LIMIT
+    if status != OK:
         jammed = _is_jammed(size, clusters)
-        if squared < math.inf and iterations < most_iterations:
-            needed, squared = _descend(size, target, most_iterations - iterations, clusters)
-            jammed = _is_jammed(
-                size, clusters
-            )  # the last iterate: impulses of the best may not have grown yet
-            iterations += needed
+        if squared_residual < math.inf and iterations < max_steps:
+            more, squared_residual = _descend(size, target, max_steps - iterations, clusters)
+            # of the last iterate: impulses of the best may not have grown yet
+            jammed = _is_jammed(size, clusters)
+            iterations += more
             for c in range(size):
-                rows[c, P] = stiff[c, BEST]
-        outcome = OK if squared <= target else INFEASIBLE if jammed else ITERATION_LIMIT
-        if not squared < math.inf:
-            outcome = NONFINITE
+                rows[c, P] = iterate[c, BEST]
+        status = OK if squared_residual <= target else INFEASIBLE if jammed else ITERATION_LIMIT
+        if not squared_residual < math.inf:
+            status = NONFINITE
     for c in range(size):
         impulses[IMPULSE, places[c]] = rows[c, P]
-    return iterations, squared, outcome
+    return iterations, squared_residual, status
 
 
 @inline_njit
 def _take_contacts(start, size, grains, network, clusters):
     """Copy the contacts of a cluster for the solver, one from each part of the cluster in turn."""
-    source, places, ends, rows, dv = (
-        clusters.source,
-        clusters.places,
-        clusters.ends,
-        clusters.rows,
-        clusters.dv,
-    )
-    contacts, constants = network.rows, grains.constants
+    source, places, ends = clusters.source, clusters.places, clusters.ends
+    rows, dv, contacts, constants = clusters.rows, clusters.dv, network.rows, grains.constants
     one, last = np.uint64(1), np.uint64(start) + size
     length = size // np.uint64(_PARTS) + one if size >= 2 * _PARTS else one  # of a part
     c = begin = np.uint64(0)
@@ -105,16 +98,11 @@ def _take_contacts(start, size, grains, network, clusters):
         mobility = mi + mj
         reduced_mass = 1 / mobility
         places[c], ends[c, FIRST], ends[c, SECOND] = place, i, j
-        rows[c, MU_NX], rows[c, MU_NY] = (
-            contacts[NX, place] * reduced_mass,
-            contacts[NY, place] * reduced_mass,
-        )
+        rows[c, MU_NX] = contacts[NX, place] * reduced_mass
+        rows[c, MU_NY] = contacts[NY, place] * reduced_mass
         rows[c, MU_U], rows[c, INVERSE_MU] = contacts[APPROACH, place] * reduced_mass, mobility
-        rows[c, INVERSE_MU_MI], rows[c, INVERSE_MU_MJ], rows[c, P] = (
-            mobility * mi,
-            mobility * mj,
-            0.0,
-        )
+        rows[c, INVERSE_MU_MI], rows[c, INVERSE_MU_MJ] = mobility * mi, mobility * mj
+        rows[c, P] = 0.0
         dv[i, 0] = dv[i, 1] = dv[j, 0] = dv[j, 1] = 0.0
         c += one
         n += length
@@ -123,23 +111,28 @@ def _take_contacts(start, size, grains, network, clusters):
             n = np.uint64(start) + begin
 
 
+@inline_njit
+def _mu_response(c, rows, ends, dv):
+    """μ (W p) of a contact, from the changes of the grains' velocities."""
+    i, j = ends[c, FIRST], ends[c, SECOND]
+    return rows[c, MU_NX] * (dv[i, 0] - dv[j, 0]) + rows[c, MU_NY] * (dv[i, 1] - dv[j, 1])
+
+
 @njit
 def _is_jammed(size, clusters):
     """Whether impulses have grown without moving anything: pᵀWp is far below −pᵀu⁻, which it is at
     a solution.
     """
     rows, ends, dv = clusters.rows, clusters.ends, clusters.dv
-    moved = felt = 0.0
+    p_w_p = minus_p_u = 0.0
     for c in range(size):
-        i, j = ends[c, FIRST], ends[c, SECOND]
-        fall = rows[c, MU_NX] * (dv[j, 0] - dv[i, 0]) + rows[c, MU_NY] * (dv[j, 1] - dv[i, 1])
-        moved -= rows[c, P] * fall * rows[c, INVERSE_MU]
-        felt -= rows[c, P] * rows[c, MU_U] * rows[c, INVERSE_MU]
-    return moved < JAMMED_RESPONSE * felt
+        p_w_p += rows[c, P] * _mu_response(c, rows, ends, dv) * rows[c, INVERSE_MU]
+        minus_p_u -= rows[c, P] * rows[c, MU_U] * rows[c, INVERSE_MU]
+    return p_w_p < JAMMED_RESPONSE * minus_p_u
 
 
 @inline_njit
-def _sweep(size, target, most_sweeps, clusters):
+def _sweep(size, target, max_sweeps, clusters):
     """Projected Gauss–Seidel sweeps with over-relaxation; returns their number and the squared
     residual.
 
@@ -149,49 +142,110 @@ def _sweep(size, target, most_sweeps, clusters):
     """
     rows, ends, dv = clusters.rows, clusters.ends, clusters.dv
     relaxation = _RELAXATION[min(size, np.uint64(_RELAXATION.size - 1))]
-    sweeps, squared, going = 0, math.inf, True
-    while going:
-        seen = 0.0
+    sweeps, squared_residual, keep_going = 0, math.inf, True
+    while keep_going:
+        estimate = 0.0
         for c in range(size):  # without a branch, which would be mispredicted
             i, j = ends[c, FIRST], ends[c, SECOND]
             ix, iy, jx, jy = dv[i, 0], dv[i, 1], dv[j, 0], dv[j, 1]
-            mu_nx, mu_ny, old = rows[c, MU_NX], rows[c, MU_NY], rows[c, P]
-            change = max(relaxation * (mu_nx * (jx - ix) + mu_ny * (jy - iy) - rows[c, MU_U]), -old)
-            rows[c, P] = old + change
-            push_i, push_j = change * rows[c, INVERSE_MU_MI], change * rows[c, INVERSE_MU_MJ]
-            dv[i, 0], dv[i, 1] = ix + push_i * mu_nx, iy + push_i * mu_ny
-            dv[j, 0], dv[j, 1] = jx - push_j * mu_nx, jy - push_j * mu_ny
+            mu_nx, mu_ny, p = rows[c, MU_NX], rows[c, MU_NY], rows[c, P]
+            change = max(relaxation * (mu_nx * (jx - ix) + mu_ny * (jy - iy) - rows[c, MU_U]), -p)
+            rows[c, P] = p + change
+            per_mass_i, per_mass_j = (
+                change * rows[c, INVERSE_MU_MI],
+                change * rows[c, INVERSE_MU_MJ],
+            )
+            dv[i, 0], dv[i, 1] = ix + per_mass_i * mu_nx, iy + per_mass_i * mu_ny
+            dv[j, 0], dv[j, 1] = jx - per_mass_j * mu_nx, jy - per_mass_j * mu_ny
             error = change * rows[c, INVERSE_MU]
-            seen += error * error
+            estimate += error * error
         sweeps += 1
-        going = sweeps < most_sweeps and seen < math.inf
-        if seen <= target * relaxation * relaxation or not going:
-            squared = 0.0
+        keep_going = sweeps < max_sweeps and estimate < math.inf
+        if estimate <= target * relaxation * relaxation or not keep_going:
+            squared_residual = 0.0
             for c in range(size):
-                i, j = ends[c, FIRST], ends[c, SECOND]
-                fall = rows[c, MU_NX] * (dv[j, 0] - dv[i, 0]) + rows[c, MU_NY] * (
-                    dv[j, 1] - dv[i, 1]
-                )
-                error = min(rows[c, P], rows[c, MU_U] - fall) * rows[c, INVERSE_MU]
-                squared += error * error
-            going &= not squared <= target
-    return sweeps, squared
+                mu_velocity = _mu_response(c, rows, ends, dv) + rows[c, MU_U]
+                error = min(rows[c, P], mu_velocity) * rows[c, INVERSE_MU]
+                squared_residual += error * error
+            keep_going &= not squared_residual <= target
+    return sweeps, squared_residual
 
 
 @njit
-def _descend(size, target, most_iterations, clusters):
+def _descend(size, target, max_iterations, clusters):
     """The guarded method of Barzilai and Borwein, from the impulses where the sweeps ended.
 
     Returns the products with W and the squared residual of the best iterate, whose impulses are in
-    ``stiff``.
+    ``iterate``. Names are those of ``contact.projected_methods.BarzilaiBorwein``.
     """
-    rows, stiff, ends, dv, matrices = (
-        clusters.rows,
-        clusters.stiff,
-        clusters.ends,
-        clusters.dv,
-        clusters.matrices,
-    )
+    rows, iterate, ends, dv = clusters.rows, clusters.iterate, clusters.ends, clusters.dv
+    _start_descent(size, clusters)
+    stride, guarded, k = 1.0, False, 0
+    iterations, best, squared_residual, last_residual = 0, math.inf, math.inf, math.inf
+    while iterations == 0 or (
+        iterations < max_iterations
+        and not squared_residual <= target
+        and squared_residual < math.inf
+    ):
+        momentum, descent = k / (k + 3.0), 0.0
+        for c in range(size):
+            i, j = ends[c, FIRST], ends[c, SECOND]
+            p, bound = rows[c, P], iterate[c, BOUND]
+            start = p + momentum * iterate[c, STEP]
+            velocity = (
+                iterate[c, RESPONSE]
+                + momentum * iterate[c, RESPONSE_CHANGE]
+                + rows[c, MU_U] * rows[c, INVERSE_MU]
+            )
+            new_p = max(0.0, start - stride * velocity / bound)
+            descent += (start - new_p) * (new_p - p) * bound
+            iterate[c, STEP] = new_p - p
+            rows[c, P] = new_p
+            dv[i, 0] = dv[i, 1] = dv[j, 0] = dv[j, 1] = 0.0
+        for c in range(size):
+            i, j, p = ends[c, FIRST], ends[c, SECOND], rows[c, P]
+            per_mass_i, per_mass_j = p * rows[c, INVERSE_MU_MI], p * rows[c, INVERSE_MU_MJ]
+            dv[i, 0] += per_mass_i * rows[c, MU_NX]
+            dv[i, 1] += per_mass_i * rows[c, MU_NY]
+            dv[j, 0] -= per_mass_j * rows[c, MU_NX]
+            dv[j, 1] -= per_mass_j * rows[c, MU_NY]
+        # with the last step s: sᵀWs, sᵀDs and (Ws)ᵀD⁻¹(Ws)
+        squared_residual = curvature = squared_step = squared_response = 0.0
+        for c in range(size):
+            bound, mu_response = iterate[c, BOUND], _mu_response(c, rows, ends, dv)
+            response = mu_response * rows[c, INVERSE_MU]
+            error = min(rows[c, P], mu_response + rows[c, MU_U]) * rows[c, INVERSE_MU]
+            step, change = iterate[c, STEP], response - iterate[c, RESPONSE]
+            iterate[c, RESPONSE_CHANGE], iterate[c, RESPONSE] = change, response
+            squared_residual += error * error
+            curvature += step * change
+            squared_step += step * step * bound
+            squared_response += change * change / bound
+        if squared_residual < best:
+            best = squared_residual
+            for c in range(size):
+                iterate[c, BEST] = rows[c, P]
+        window_ends = iterations % WINDOW == WINDOW - 1
+        if guarded or (window_ends and not math.sqrt(best) < PROGRESS * last_residual):
+            stride, k = 1.0, k + 1 if guarded and not descent > 0.0 else 0
+            guarded = True
+        else:
+            is_long = iterations % 2 == 1
+            numerator = squared_step if is_long else curvature
+            denominator = curvature if is_long else squared_response
+            stride = LONGEST_STRIDE
+            if denominator > 0.0:
+                stride = min(numerator / denominator, LONGEST_STRIDE)
+        last_residual = math.sqrt(best) if window_ends else last_residual
+        iterations += 1
+    return iterations, best
+
+
+@inline_njit
+def _start_descent(size, clusters):
+    """Write the diagonal D and the response W p of the contacts of a cluster."""
+    rows, iterate, ends = clusters.rows, clusters.iterate, clusters.ends
+    dv, matrices = clusters.dv, clusters.matrices
     for c in range(size):
         for end in range(2):
             matrices[ends[c, end], 0] = matrices[ends[c, end], 1] = matrices[ends[c, end], 2] = 0.0
@@ -210,60 +264,6 @@ def _descend(size, target, most_iterations, clusters):
         width_i = largest_eigenvalue(matrices[i, 0], matrices[i, 1], matrices[i, 2])
         width_j = largest_eigenvalue(matrices[j, 0], matrices[j, 1], matrices[j, 2])
         bound = width_i * inverse_mass_i + width_j * inverse_mass_j
-        stiff[c, BOUND], stiff[c, STEP], stiff[c, CHANGE], stiff[c, BEST] = (
-            bound,
-            0.0,
-            0.0,
-            rows[c, P],
-        )
-        stiff[c, RESPONSE] = nx * (dv[i, 0] - dv[j, 0]) + ny * (dv[i, 1] - dv[j, 1])
-    stride, momentum, before, best, squared = 1.0, -1, math.inf, math.inf, math.inf
-    iterations = 0
-    while iterations == 0 or (
-        iterations < most_iterations and not squared <= target and squared < math.inf
-    ):
-        push, descent = max(momentum, 0) / (max(momentum, 0) + 3.0), 0.0
-        for c in range(size):
-            i, j = ends[c, FIRST], ends[c, SECOND]
-            old, bound = rows[c, P], stiff[c, BOUND]
-            at = old + push * stiff[c, STEP]
-            slope = (
-                stiff[c, RESPONSE] + push * stiff[c, CHANGE] + rows[c, MU_U] * rows[c, INVERSE_MU]
-            )
-            new = max(0.0, at - stride * slope / bound)
-            descent += (at - new) * (new - old) * bound
-            stiff[c, STEP] = new - old
-            rows[c, P] = new
-            dv[i, 0] = dv[i, 1] = dv[j, 0] = dv[j, 1] = 0.0
-        for c in range(size):
-            i, j, press = ends[c, FIRST], ends[c, SECOND], rows[c, P]
-            push_i, push_j = press * rows[c, INVERSE_MU_MI], press * rows[c, INVERSE_MU_MJ]
-            dv[i, 0] += push_i * rows[c, MU_NX]
-            dv[i, 1] += push_i * rows[c, MU_NY]
-            dv[j, 0] -= push_j * rows[c, MU_NX]
-            dv[j, 1] -= push_j * rows[c, MU_NY]
-        squared = mixed = long = short = 0.0
-        for c in range(size):
-            i, j, bound = ends[c, FIRST], ends[c, SECOND], stiff[c, BOUND]
-            pull = rows[c, MU_NX] * (dv[i, 0] - dv[j, 0]) + rows[c, MU_NY] * (dv[i, 1] - dv[j, 1])
-            response = pull * rows[c, INVERSE_MU]
-            error = min(rows[c, P], pull + rows[c, MU_U]) * rows[c, INVERSE_MU]
-            step, change = stiff[c, STEP], response - stiff[c, RESPONSE]
-            stiff[c, CHANGE], stiff[c, RESPONSE] = change, response
-            squared += error * error
-            mixed += step * change
-            long += step * step * bound
-            short += change * change / bound
-        if squared < best:
-            best = squared
-            for c in range(size):
-                stiff[c, BEST] = rows[c, P]
-        judged = iterations % WINDOW == WINDOW - 1
-        if momentum >= 0 or (judged and not math.sqrt(best) < PROGRESS * before):
-            momentum, stride = 0 if descent > 0.0 else max(momentum, -1) + 1, 1.0
-        else:
-            over, under = (mixed, short) if iterations % 2 == 0 else (long, mixed)
-            stride = min(over / under, LONGEST_STRIDE) if under > 0.0 else LONGEST_STRIDE
-        before = math.sqrt(best) if judged else before
-        iterations += 1
-    return iterations, best
+        iterate[c, BOUND], iterate[c, BEST] = bound, rows[c, P]
+        iterate[c, STEP] = iterate[c, RESPONSE_CHANGE] = 0.0
+        iterate[c, RESPONSE] = nx * (dv[i, 0] - dv[j, 0]) + ny * (dv[i, 1] - dv[j, 1])

@@ -1,4 +1,6 @@
-"""Compilation by numba: without its runtime, and with the law of a contact from its only source."""
+"""Compilation by numba: without its runtime, and with the law of a contact and the images of the
+cell from their only source.
+"""
 
 import inspect
 import math
@@ -10,6 +12,7 @@ import numba
 import numpy as np
 
 from jaxgran.contact import law
+from jaxgran.model import cell
 
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
@@ -35,9 +38,9 @@ def _maximum(a, b):
     return a if a > b else b
 
 
-def _compiled_law(module: ModuleType) -> dict[str, Any]:
+def _compiled(module: ModuleType) -> dict[str, Any]:
     """The functions of a module that is written for arrays of JAX, compiled for numbers from the
-    same source.
+    same source where they are called.
     """
     names: dict[str, Any] = {
         **vars(module),
@@ -45,6 +48,8 @@ def _compiled_law(module: ModuleType) -> dict[str, Any]:
         "maximum": _maximum,
         "sqrt": math.sqrt,
         "ceil": np.ceil,
+        "floor": np.floor,
+        "rint": np.rint,
     }
     functions = {
         name: f
@@ -56,4 +61,4 @@ def _compiled_law(module: ModuleType) -> dict[str, Any]:
     return {name: names[name] for name in functions}
 
 
-LAW = _compiled_law(law)  # the functions of ``contact.law``
+LAW, CELL = _compiled(law), _compiled(cell)

@@ -28,9 +28,8 @@ from jaxgran.model.checks import InputError
 
 TARGET = "jaxgran_advance"
 STOP = "jaxgran_stop"  # a word in the object file; the engine runs while it is zero
-THREADS = (
-    "jaxgran_threads"  # a word in the object file: threads that advance the replicas of a call
-)
+# A word in the object file: threads that advance the replicas of a call
+THREADS = "jaxgran_threads"
 _LOCK = Lock()
 _MOST_KEPT = 8  # object files in the cache
 _CACHE_FOLDER = "NUMBA_CACHE_DIR"  # environment variable, honoured as numba does
@@ -112,8 +111,7 @@ def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
         warnings.warn(
             "the numba engine is compiled anew in every process, in about 15 s: the cache folder "
             f"{str(path.parent)!r} cannot be written ({error.strerror}); set XDG_CACHE_HOME or "
-            f"{_CACHE_FOLDER} to "
-            "one that can.",
+            f"{_CACHE_FOLDER} to one that can.",
             stacklevel=3,
         )
     return content

@@ -30,13 +30,29 @@ import numba
 from llvmlite import binding as llvm
 from numba import types
 
-from jaxgran.dynamics.numba_engine.allocation import arrays_of, doubles_at, integers_at
+from jaxgran.dynamics.numba_engine.allocation import (
+    arrays_of,
+    doubles_at,
+    inputs_at,
+    integers_at,
+)
 from jaxgran.dynamics.numba_engine.compilation import OPTIONS, inline_njit
 from jaxgran.dynamics.numba_engine.layout import (
+    BLOCKS,
     CAPACITY,
-    INPUTS,
+    INPUT_NUMBERS,
+    MASSES,
+    MEMORY,
+    NEW_POSITIONS,
+    NEW_VELOCITIES,
+    NUMBERS_GIVEN,
+    POSITIONS,
+    RADII,
+    RECORDS,
     RESULTS,
     STATUS,
+    STEPS,
+    VELOCITIES,
     WORDS,
     WORDS_PER_GRAIN,
 )
@@ -185,14 +201,14 @@ def _handler(frame, replica, stop):
         return 0
     args, rets = _word(frame, ARGS), _word(frame, RETS)
     if replica == _COUNT:
-        return _replicas(args, 4)
-    grains = _length(args, 2, 1)
-    room, record = _length(rets, 4, 2), _length(rets, 4, 1)
-    blocks = _length(args, 5, 1)
-    results = doubles_at(_data(rets, 2, replica, blocks * RESULTS), (blocks, RESULTS))
+        return _replicas(args, NUMBERS_GIVEN)
+    grains = _length(args, RADII, 1)
+    room, record = _length(rets, RECORDS, 2), _length(rets, RECORDS, 1)
+    blocks = _length(args, STEPS, 1)
+    results = doubles_at(_data(rets, BLOCKS, replica, blocks * RESULTS), (blocks, RESULTS))
     words = 1 + WORDS + WORDS_PER_GRAIN * grains
-    kept = _length(rets, 3, 1) > 0  # the memory outlasts the call
-    block = _data(rets, 3, replica, words) if kept else _allocate(8 * words)
+    kept = _length(rets, MEMORY, 1) > 0  # the memory outlasts the call
+    block = _data(rets, MEMORY, replica, words) if kept else _allocate(8 * words)
     if block == 0:
         return _refuse(results)
     memory = integers_at(block, (1,))
@@ -203,16 +219,16 @@ def _handler(frame, replica, stop):
             _release(block)
         return _refuse(results)
     advance_loop(
-        doubles_at(_data(args, 0, replica, 2 * grains), (grains, 2)),
-        doubles_at(_data(args, 1, replica, 2 * grains), (grains, 2)),
-        doubles_at(_data(args, 2, replica, grains), (grains,)),
-        doubles_at(_data(args, 3, replica, grains), (grains,)),
-        doubles_at(_data(args, 4, replica, INPUTS), (INPUTS,)),
-        doubles_at(_data(args, 5, replica, blocks), (blocks,)),
-        doubles_at(_data(rets, 0, replica, 2 * grains), (grains, 2)),
-        doubles_at(_data(rets, 1, replica, 2 * grains), (grains, 2)),
+        doubles_at(_data(args, POSITIONS, replica, 2 * grains), (grains, 2)),
+        doubles_at(_data(args, VELOCITIES, replica, 2 * grains), (grains, 2)),
+        doubles_at(_data(args, RADII, replica, grains), (grains,)),
+        doubles_at(_data(args, MASSES, replica, grains), (grains,)),
+        inputs_at(_data(args, NUMBERS_GIVEN, replica, INPUT_NUMBERS), (1,))[0],
+        doubles_at(_data(args, STEPS, replica, blocks), (blocks,)),
+        doubles_at(_data(rets, NEW_POSITIONS, replica, 2 * grains), (grains, 2)),
+        doubles_at(_data(rets, NEW_VELOCITIES, replica, 2 * grains), (grains, 2)),
         results,
-        doubles_at(_data(rets, 4, replica, room * record), (room, record)),
+        doubles_at(_data(rets, RECORDS, replica, room * record), (room, record)),
         arrays,
         integers_at(stop, (1,)),
     )

@@ -4,222 +4,170 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.numba_engine.compilation import inline_njit, njit
+from jaxgran.dynamics.numba_engine.compilation import CELL, inline_njit, njit
 from jaxgran.dynamics.numba_engine.layout import (
-    ACROSS,
     FIRST,
-    INVERSE_MASS,
+    IMAGE_ROW,
+    IMAGE_X,
     RADIUS,
-    ROW,
     SECOND,
-    VX,
-    VY,
     X,
     Y,
 )
 
+nearest_image = CELL["nearest_image"]
+
 # strain: the longest life of a list, in which a peculiar speed grows by a factor of 1.1 at most
 LIFE = 0.1
 _ATTEMPTS = 12  # with ever narrower skins, while a list has more pairs than room
-_CACHED_GRAINS, _ROW_HEIGHT = 2000, 2.0  # larger flows are put in order, in cells of two diameters
 
 
 @inline_njit
-def skin_loss(fastest, rate, distance):
-    """The rate at which a list may lose its skin, for pairs within a distance."""
-    return 2 * fastest * (1 + LIFE) + rate * distance / 2
+def closing_speed_bound(max_speed, shear_rate, distance):
+    """Bound on how fast the gap of a pair within a distance closes while a list is valid, see
+    ``dynamics.step``.
+    """
+    return 2 * max_speed * (1 + LIFE) + shear_rate * distance / 2
 
 
 @njit
-def put_in_order(positions, side, tilt, order):
-    """Write an order of the grains, row by row, that keeps neighbours close in memory if a flow
-    outgrows the caches.
-    """
-    given, cells, starts, count = order.given, order.cells, order.starts, order.given.size
-    across = (
-        int(max(1.0, min(math.sqrt(count), side / _ROW_HEIGHT))) if count > _CACHED_GRAINS else 1
-    )
-    for c in range(across * across + 1):
-        starts[c] = 0
-    for g in range(count):
-        cells[g] = 0
-        if across > 1 and abs(positions[g, 0]) < math.inf and abs(positions[g, 1]) < math.inf:
-            row = min(max(int(positions[g, 1] / side * across), 0), across - 1)
-            fraction = (positions[g, 0] - tilt * positions[g, 1]) / side
-            column = int((fraction - math.floor(fraction)) * across)
-            cells[g] = row * across + min(max(column, 0), across - 1)
-        starts[cells[g] + 1] += 1
-    for c in range(across * across):
-        starts[c + 1] += starts[c]
-    for g in range(count):
-        given[starts[cells[g]]] = g
-        starts[cells[g]] += 1
-
-
-@inline_njit
-def bring_into_cell(grains, side, tilt, rate):
-    """Bring the grains into the cell, at the same peculiar velocities; returns the largest peculiar
-    speed.
-    """
-    motion = grains.motion
-    fastest = 0.0
-    for g in range(motion.shape[0]):
-        cx, cy = motion[g, VX] - rate * motion[g, Y], motion[g, VY]
-        row = math.floor(motion[g, Y] / side)
-        motion[g, Y] -= row * side
-        motion[g, X] -= row * tilt * side
-        motion[g, X] -= math.floor((motion[g, X] - tilt * motion[g, Y]) / side) * side
-        motion[g, VX] = cx + rate * motion[g, Y]
-        fastest = max(fastest, cx * cx + cy * cy)
-    return math.sqrt(fastest)
-
-
-@njit
-def search(grains, pairs, side, tilt, largest, skin):
+def search(grains, pairs, side, tilt, largest_diameter, skin):
     """Write the pairs with a gap within a skin, which is narrowed until there is room for all of
     them.
 
     Returns their number, the skin, and whether there was room.
     """
-    room = pairs.of_grain.size // 2
-    found = 0
+    capacity = pairs.of_grain.size // 2
+    count = 0
     for _ in range(_ATTEMPTS):
-        found = find_near_pairs(grains, pairs, side, tilt, largest + skin, skin, room)
-        if found <= room:
+        count = find_near_pairs(grains, pairs, side, tilt, largest_diameter + skin, skin, capacity)
+        if count <= capacity:
             break
         skin *= 0.7
-    kept = min(found, room)
+    kept = min(count, capacity)
     _index_pairs(pairs, kept)
-    return kept, skin, found <= room
+    return kept, skin, count <= capacity
 
 
 @njit
-def find_near_pairs(grains, pairs, side, tilt, reach, skin, room):
-    """Write the pairs with a gap within the skin, and their images; pairs beyond the room are
-    counted, not written.
+def find_near_pairs(grains, pairs, side, tilt, reach, skin, capacity):
+    """Write the pairs with a gap within the skin, and their images; pairs beyond the capacity
+    are counted, not written.
     """
     most = math.sqrt(pairs.starts.size - 1)
-    up, along = (
-        int(min(most, side / reach)),
-        int(min(most, side / (reach * math.sqrt(1.0 + tilt * tilt)))),
-    )
-    if up >= 3 and along >= 3:
-        _sort_into_cells(grains, pairs, side, tilt, up, along)
-        return _pairs_of_cells(pairs, side, tilt, up, along, skin, room)
-    return _pairs_of_all(grains, pairs, side, tilt, skin, room)
+    rows = int(min(most, side / reach))
+    columns = int(min(most, side / (reach * math.sqrt(1.0 + tilt * tilt))))
+    if rows >= 3 and columns >= 3:
+        _sort_into_cells(grains, pairs, side, tilt, rows, columns)
+        return _pairs_of_cells(pairs, side, tilt, rows, columns, skin, capacity)
+    return _pairs_of_all(grains, pairs, side, tilt, skin, capacity)
 
 
 @inline_njit
-def _sort_into_cells(grains, pairs, side, tilt, up, along):
+def _sort_into_cells(grains, pairs, side, tilt, rows, columns):
     """Sort the grains into cells row by row, those of a cell at ``starts[cell] : starts[cell +
     1]``.
     """
     motion, constants = grains.motion, grains.constants
     starts, cells, sorted_grains, places = pairs.starts, pairs.cells, pairs.sorted, pairs.places
-    for cell in range(up * along + 1):
+    for cell in range(rows * columns + 1):
         starts[cell] = 0
     for g in range(motion.shape[0]):
-        row = min(max(int(motion[g, Y] / side * up), 0), up - 1)
+        row = min(max(int(motion[g, Y] / side * rows), 0), rows - 1)
         fraction = (motion[g, X] - tilt * motion[g, Y]) / side
-        cells[g] = row * along + min(max(int(fraction * along), 0), along - 1)
+        cells[g] = row * columns + min(max(int(fraction * columns), 0), columns - 1)
         starts[cells[g] + 1] += 1
-    for cell in range(up * along):
+    for cell in range(rows * columns):
         starts[cell + 1] += starts[cell]
-    for g in range(
-        motion.shape[0] - 1, -1, -1
-    ):  # a cell is filled from its end, which moves to its beginning
+    # A cell is filled from its end, which moves to its beginning
+    for g in range(motion.shape[0] - 1, -1, -1):
         starts[cells[g] + 1] -= 1
         n = starts[cells[g] + 1]
         sorted_grains[n] = g
         places[0, n], places[1, n], places[2, n] = motion[g, X], motion[g, Y], constants[g, RADIUS]
-    for cell in range(up * along):
+    for cell in range(rows * columns):
         starts[cell] = starts[cell + 1]
-    starts[up * along] = motion.shape[0]
+    starts[rows * columns] = motion.shape[0]
 
 
 @inline_njit
-def _pairs_of_cells(pairs, side, tilt, up, along, skin, room):
+def _pairs_of_cells(pairs, side, tilt, rows, columns, skin, capacity):
     """Pairs within each cell, with its right neighbour, and with the three above it."""
     starts, sorted_grains, places = pairs.starts, pairs.sorted, pairs.places
     ends, images = pairs.ends, pairs.images
-    found = 0
-    for cell in range(up * along):
-        row, column = cell // along, cell % along
-        above, over = (row + 1) * along, 0
-        if row + 1 == up:
-            above, over = 0, 1
+    count = 0
+    for cell in range(rows * columns):
+        row, column = cell // columns, cell % columns
+        above, image_above = (row + 1) * columns, 0  # first cell of the next row, and its image
+        if row + 1 == rows:
+            above, image_above = 0, 1
         for part in range(4):  # stretches of cells in a row, those across the boundary apart
-            begin = end = across = lift = 0
+            begin = end = image_column = image_row = 0
             if part == 0:
-                end = starts[cell + 1 if column + 1 == along else cell + 2]
-            elif part == 1 and column + 1 == along:
-                begin, end, across = starts[row * along], starts[row * along + 1], 1
+                end = starts[cell + 1 if column + 1 == columns else cell + 2]
+            elif part == 1 and column + 1 == columns:
+                begin, end = starts[row * columns], starts[row * columns + 1]
+                image_column = 1
             elif part == 2:
-                begin, end = (
-                    starts[above + max(column - 1, 0)],
-                    starts[above + min(column + 2, along)],
-                )
-                lift = over
+                begin = starts[above + max(column - 1, 0)]
+                end = starts[above + min(column + 2, columns)]
+                image_row = image_above
             elif part == 3 and column == 0:
-                begin, end, across, lift = (
-                    starts[above + along - 1],
-                    starts[above + along],
-                    -1,
-                    over,
-                )
-            elif part == 3 and column + 1 == along:
-                begin, end, across, lift = starts[above], starts[above + 1], 1, over
-            shift, rise = (across + lift * tilt) * side, lift * side
+                begin, end = starts[above + columns - 1], starts[above + columns]
+                image_column, image_row = -1, image_above
+            elif part == 3 and column + 1 == columns:
+                begin, end = starts[above], starts[above + 1]
+                image_column, image_row = 1, image_above
+            image_x, image_y = (image_column + image_row * tilt) * side, image_row * side
             for m in range(starts[cell], starts[cell + 1]):
-                i, x, y, width = (
-                    sorted_grains[m],
-                    places[0, m] - shift,
-                    places[1, m] - rise,
-                    places[2, m] + skin,
-                )
+                i, x, y = sorted_grains[m], places[0, m] - image_x, places[1, m] - image_y
+                radius_and_skin = places[2, m] + skin
                 for n in range(m + 1 if part == 0 else begin, end):
-                    dx, dy, limit = x - places[0, n], y - places[1, n], width + places[2, n]
-                    at = np.uint64(
-                        min(found, room)
-                    )  # without a branch, which would be mispredicted
-                    ends[FIRST, at], ends[SECOND, at] = i, sorted_grains[n]
-                    images[ACROSS, at], images[ROW, at] = shift, lift
-                    found += dx * dx + dy * dy <= limit * limit
-    return found
+                    dx, dy, reach = (
+                        x - places[0, n],
+                        y - places[1, n],
+                        radius_and_skin + places[2, n],
+                    )
+                    # without a branch, which would be mispredicted
+                    p = np.uint64(min(count, capacity))
+                    ends[FIRST, p], ends[SECOND, p] = i, sorted_grains[n]
+                    images[IMAGE_X, p], images[IMAGE_ROW, p] = image_x, image_row
+                    count += dx * dx + dy * dy <= reach * reach
+    return count
 
 
 @inline_njit
-def _pairs_of_all(grains, pairs, side, tilt, skin, room):
+def _pairs_of_all(grains, pairs, side, tilt, skin, capacity):
     """Compare all pairs by nearest images, in a periodic cell too small for a grid of 3×3."""
     motion, constants, ends, images = grains.motion, grains.constants, pairs.ends, pairs.images
-    found = 0
+    count = 0
     for i in range(motion.shape[0]):
         for j in range(i):
             dx, dy = motion[i, X] - motion[j, X], motion[i, Y] - motion[j, Y]
-            row = int(np.rint(dy / side))
-            shift = np.rint((dx - row * tilt * side) / side) * side + row * tilt * side
-            dx, dy = dx - shift, dy - row * side
-            limit = constants[i, RADIUS] + constants[j, RADIUS] + skin
-            if dx * dx + dy * dy <= limit * limit:
-                if found < room:
-                    ends[FIRST, found], ends[SECOND, found] = i, j
-                    images[ACROSS, found], images[ROW, found] = shift, row
-                found += 1
-    return found
+            column, row = nearest_image(dx, dy, side, tilt)
+            image_x = column * side + row * tilt * side
+            dx, dy = dx - image_x, dy - row * side
+            reach = constants[i, RADIUS] + constants[j, RADIUS] + skin
+            if dx * dx + dy * dy <= reach * reach:
+                if count < capacity:
+                    ends[FIRST, count], ends[SECOND, count] = i, j
+                    images[IMAGE_X, count], images[IMAGE_ROW, count] = image_x, row
+                count += 1
+    return count
 
 
 @inline_njit
-def _index_pairs(pairs, found):
+def _index_pairs(pairs, count):
     """The pairs of grain g are those in ``of_grain[offsets[g] : offsets[g + 1]]``."""
     ends, offsets, of_grain = pairs.ends, pairs.offsets, pairs.of_grain
     for g in range(offsets.size):
         offsets[g] = 0
-    for p in range(found):
+    for p in range(count):
         offsets[ends[FIRST, p] + 1] += 1
         offsets[ends[SECOND, p] + 1] += 1
     for g in range(1, offsets.size):
         offsets[g] += offsets[g - 1]
-    for p in range(found):
+    for p in range(count):
         for end in range(2):
             g = ends[end, p]
             of_grain[offsets[g]] = p
@@ -227,20 +175,3 @@ def _index_pairs(pairs, found):
     for g in range(offsets.size - 1, 0, -1):
         offsets[g] = offsets[g - 1]
     offsets[0] = 0
-
-
-@inline_njit
-def kinetic_sums(grains, rate):
-    """Σ m c_x c_x, Σ m c_x c_y and Σ m c_y c_y, just after a search."""
-    motion, constants = grains.motion, grains.constants
-    xx = xy = yy = 0.0
-    for g in range(motion.shape[0]):
-        cx, cy, mass = (
-            motion[g, VX] - rate * motion[g, Y],
-            motion[g, VY],
-            1 / constants[g, INVERSE_MASS],
-        )
-        xx += mass * cx * cx
-        xy += mass * cx * cy
-        yy += mass * cy * cy
-    return xx, xy, yy

@@ -21,35 +21,31 @@ from jaxgran.dynamics.numba_engine.layout import (
 
 @inline_njit
 def make_network(contacts, t, flow, grains, pairs, network):
-    """Write the contacts of a step and their grains; returns their number, Σ min(0, u⁻)² and the
-    deepest overlap.
+    """Write the contacts of a step and their grains; returns the number of the grains, Σ min(0,
+    u⁻)² and the largest overlap.
     """
-    met, ends, rows, degree, touched = (
-        network.met,
-        network.ends,
-        network.rows,
-        network.degree,
-        network.touched,
-    )
+    ends, rows, degree, touched = network.ends, network.rows, network.degree, network.touched
     constants = grains.constants
-    hits, scale, deepest = 0, 0.0, 0.0
+    touched_count, scale, largest_overlap = 0, 0.0, 0.0
     for c in range(contacts):
-        i, j, dx, dy, ux, uy = pair_motion(met[c], t, flow, grains, pairs)
+        i, j, dx, dy, ux, uy = pair_motion(network.near_pair[c], t, flow, grains, pairs)
         distance = math.sqrt(dx * dx + dy * dy)
         dx, dy = dx / distance, dy / distance
         approach = ux * dx + uy * dy
         ends[FIRST, c], ends[SECOND, c] = i, j
         rows[NX, c], rows[NY, c], rows[APPROACH, c] = dx, dy, approach
         rows[DISTANCE, c], rows[IMPULSE, c] = distance, 0.0
-        deepest = max(deepest, constants[i, RADIUS] + constants[j, RADIUS] - distance)
+        largest_overlap = max(
+            largest_overlap, constants[i, RADIUS] + constants[j, RADIUS] - distance
+        )
         scale += min(approach, 0.0) * approach
         for end in range(2):
             g = ends[end, c]
             if degree[g] == 0:
-                touched[hits] = g
-                hits += 1
+                touched[touched_count] = g
+                touched_count += 1
             degree[g] += 1
-    return hits, scale, deepest
+    return touched_count, scale, largest_overlap
 
 
 @inline_njit
@@ -68,35 +64,35 @@ def solve_isolated(contacts, grains, network):
 
 
 @inline_njit
-def find_clusters(contacts, hits, network, clusters):
+def find_clusters(contacts, touched_count, network, clusters):
     """Find the clusters in which a contact approaches, each by a breadth-first search from such a
     contact.
 
     Returns their number; the contacts of cluster m are ``source[starts[m] : starts[m + 1]]``.
     """
     ends, rows, degree, touched = network.ends, network.rows, network.degree, network.touched
-    source, starts, queue, reached = (
+    source, starts, of_grain, offsets = (
         clusters.source,
         clusters.starts,
-        clusters.queue,
-        clusters.reached,
+        clusters.of_grain,
+        clusters.offsets,
     )
-    of_grain, offsets = clusters.of_grain, clusters.offsets
+    queue, reached = clusters.queue, clusters.reached
     total = 0
-    for h in range(hits):
-        total += degree[touched[h]]
-        offsets[touched[h]] = total
+    for n in range(touched_count):
+        total += degree[touched[n]]
+        offsets[touched[n]] = total
     for c in range(contacts):
         for end in range(2):
             g = ends[end, c]
             offsets[g] -= 1
             of_grain[offsets[g]] = c
-    found = size = 0
+    count = size = 0
     for c in range(contacts):
         i, j = ends[FIRST, c], ends[SECOND, c]
         if rows[APPROACH, c] < 0.0 and reached[i] == 0 and (degree[i] > 1 or degree[j] > 1):
-            starts[found] = size
-            found += 1
+            starts[count] = size
+            count += 1
             first, last = 0, 1  # of the grains that wait in the queue
             queue[0] = i
             reached[i] = WAITING
@@ -114,29 +110,24 @@ def find_clusters(contacts, hits, network, clusters):
                         reached[other] = WAITING
                         queue[last] = other
                         last += 1
-    starts[found] = size
-    return found
+    starts[count] = size
+    return count
 
 
 @inline_njit
-def gather_kicks(contacts, hits, one_plus_alpha, network):
+def sum_impulses(contacts, touched_count, one_plus_alpha, network):
     """Add up the impulses on every grain, and its contacts that carry one."""
-    ends, rows, touched, kicks, loaded = (
-        network.ends,
-        network.rows,
-        network.touched,
-        network.kicks,
-        network.loaded,
-    )
-    for h in range(hits):
-        kicks[touched[h], 0] = kicks[touched[h], 1] = 0.0
+    ends, rows, touched = network.ends, network.rows, network.touched
+    impulses, loaded = network.impulses, network.loaded
+    for n in range(touched_count):
+        impulses[touched[n], 0] = impulses[touched[n], 1] = 0.0
     for c in range(contacts):
-        push = one_plus_alpha * rows[IMPULSE, c]
-        if push > 0.0:
+        impulse = one_plus_alpha * rows[IMPULSE, c]
+        if impulse > 0.0:
             i, j = ends[FIRST, c], ends[SECOND, c]
-            kicks[i, 0] += push * rows[NX, c]
-            kicks[i, 1] += push * rows[NY, c]
-            kicks[j, 0] -= push * rows[NX, c]
-            kicks[j, 1] -= push * rows[NY, c]
+            impulses[i, 0] += impulse * rows[NX, c]
+            impulses[i, 1] += impulse * rows[NY, c]
+            impulses[j, 0] -= impulse * rows[NX, c]
+            impulses[j, 1] -= impulse * rows[NY, c]
             loaded[i] += 1
             loaded[j] += 1

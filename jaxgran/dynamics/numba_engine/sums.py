@@ -26,9 +26,8 @@ _PADDED = (_TERMS + 7) // 8 * 8  # the terms are added eight at a time
 _PADS = _PADDED - _TERMS
 _DURATION, _STEPS, _KINETIC = place_of("duration"), place_of("steps"), place_of("kinetic_moment")
 COLLISIONS = place_of("collisions")
-_SOLVES, _ITERATIONS, _UNCONVERGED = (
-    place_of(name) for name in ("solves", "iterations", "unconverged")
-)
+_SOLVES, _ITERATIONS = place_of("solves"), place_of("iterations")
+_UNCONVERGED = place_of("unconverged")
 _LARGEST_OVERLAP, _WORST_RESIDUAL = place_of("largest_overlap"), place_of("worst_residual")
 
 
@@ -53,13 +52,8 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
     """Add what the contacts of one step contribute, by the law of a contact; ``step_sums`` is
     memory for it.
     """
-    ends, rows, kicks, loaded, constants = (
-        network.ends,
-        network.rows,
-        network.kicks,
-        network.loaded,
-        grains.constants,
-    )
+    ends, rows, constants = network.ends, network.rows, grains.constants
+    impulses, loaded = network.impulses, network.loaded
     for n in range(_PADDED):
         step_sums[n] = 0.0
     for c in range(contacts):
@@ -67,8 +61,8 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
         nx, ny, approach, distance = rows[NX, c], rows[NY, c], rows[APPROACH, c], rows[DISTANCE, c]
         mi, mj = constants[i, INVERSE_MASS], constants[j, INVERSE_MASS]
         impulse = one_plus_alpha * rows[IMPULSE, c]
-        change = nx * (kicks[i, 0] * mi - kicks[j, 0] * mj) + ny * (
-            kicks[i, 1] * mi - kicks[j, 1] * mj
+        change = nx * (impulses[i, 0] * mi - impulses[j, 0] * mj) + ny * (
+            impulses[i, 1] * mi - impulses[j, 1] * mj
         )
         terms = contact_terms(
             nx,
@@ -93,10 +87,10 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
 
 
 @inline_njit
-def add_solve(sums, iterations, residual, outcome, deepest):
+def add_solve(sums, iterations, residual, status, overlap):
     """Add one solve."""
     sums[_SOLVES] += 1
     sums[_ITERATIONS] += iterations
-    sums[_UNCONVERGED] += outcome != OK
-    sums[_LARGEST_OVERLAP] = max(sums[_LARGEST_OVERLAP], deepest)
+    sums[_UNCONVERGED] += status != OK
+    sums[_LARGEST_OVERLAP] = max(sums[_LARGEST_OVERLAP], overlap)
     sums[_WORST_RESIDUAL] = max(sums[_WORST_RESIDUAL], residual)

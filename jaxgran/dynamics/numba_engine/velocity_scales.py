@@ -4,10 +4,12 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.numba_engine.compilation import njit
+from jaxgran.dynamics.numba_engine.compilation import CELL, njit
 from jaxgran.dynamics.numba_engine.layout import INVERSE_MASS, VX, VY, X, Y
 from jaxgran.dynamics.tally import place_of
 from jaxgran.dynamics.velocity_scales import BOX_GRAINS, WAVES
+
+remap_tilt = CELL["remap_tilt"]
 
 _DURATION, _READ_UNTIL = place_of("duration"), place_of("read_until")
 _LOCAL, _WAVE = place_of("local_kinetic"), place_of("wave_kinetic")
@@ -15,12 +17,12 @@ _AMPLITUDES = 4 * len(WAVES)  # real and imaginary parts of both components
 
 
 @njit
-def read_velocity_scales(t, tilt, side, rate, grains, boxes, amplitudes, results):
+def read_velocity_scales(t, tilt, side, shear_rate, grains, boxes, amplitudes, results):
     """Add a reading of the state at the time t since the search, which stands for the time since
     the last reading.
 
     Args:
-      t, tilt, side, rate: the time, tilt and side of the cell then, and the shear rate.
+      t, tilt, side, shear_rate: the time, tilt and side of the cell then, and the shear shear_rate.
       grains: the grains.
       boxes: (grains, 3) memory for the mass and the momentum of each box.
       amplitudes: memory for ``_AMPLITUDES`` numbers.
@@ -28,7 +30,7 @@ def read_velocity_scales(t, tilt, side, rate, grains, boxes, amplitudes, results
     """
     motion, constants, count = grains.motion, grains.constants, grains.motion.shape[0]
     across = max(1, int(np.rint(math.sqrt(count / BOX_GRAINS))))
-    tilt -= math.floor(tilt + 0.5)
+    tilt = remap_tilt(tilt)
     for box in range(across * across):
         boxes[box, 0] = boxes[box, 1] = boxes[box, 2] = 0.0
     for n in range(_AMPLITUDES):
@@ -36,7 +38,7 @@ def read_velocity_scales(t, tilt, side, rate, grains, boxes, amplitudes, results
     energy, total = 0.0, 0.0  # Σ m c² and Σ m
     for g in range(count):
         x, y = motion[g, X] + motion[g, VX] * t, motion[g, Y] + motion[g, VY] * t
-        cx, cy, mass = motion[g, VX] - rate * y, motion[g, VY], 1 / constants[g, INVERSE_MASS]
+        cx, cy, mass = motion[g, VX] - shear_rate * y, motion[g, VY], 1 / constants[g, INVERSE_MASS]
         sx, sy = (x - tilt * y) / side, y / side
         sx, sy = sx - math.floor(sx), sy - math.floor(sy)
         px, py = mass * cx, mass * cy

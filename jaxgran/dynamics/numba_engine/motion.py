@@ -1,0 +1,109 @@
+"""The grains in the laboratory frame: read from a state, moved, and written back."""
+
+import math
+
+from jaxgran.dynamics.numba_engine.compilation import CELL, inline_njit, njit
+from jaxgran.dynamics.numba_engine.layout import INVERSE_MASS, RADIUS, VX, VY, X, Y
+
+image_in_cell = CELL["image_in_cell"]
+
+_CACHED_GRAINS, _ROW_HEIGHT = 2000, 2.0  # larger flows are put in order, in cells of two diameters
+
+
+@njit
+def put_in_order(positions, side, tilt, order):
+    """Write an order of the grains, row by row, that keeps neighbours close in memory if a flow
+    outgrows the caches.
+    """
+    in_state, cells, starts, count = order.in_state, order.cells, order.starts, order.in_state.size
+    across = 1
+    if count > _CACHED_GRAINS:
+        across = int(max(1.0, min(math.sqrt(count), side / _ROW_HEIGHT)))
+    for c in range(across * across + 1):
+        starts[c] = 0
+    for g in range(count):
+        cells[g] = 0
+        if across > 1 and abs(positions[g, 0]) < math.inf and abs(positions[g, 1]) < math.inf:
+            row = min(max(int(positions[g, 1] / side * across), 0), across - 1)
+            fraction = (positions[g, 0] - tilt * positions[g, 1]) / side
+            column = int((fraction - math.floor(fraction)) * across)
+            cells[g] = row * across + min(max(column, 0), across - 1)
+        starts[cells[g] + 1] += 1
+    for c in range(across * across):
+        starts[c + 1] += starts[c]
+    for g in range(count):
+        in_state[starts[cells[g]]] = g
+        starts[cells[g]] += 1
+
+
+@njit
+def read_state(positions, velocities, radii, masses, in_state, shear_rate, grains):
+    """Copy the grains, with velocities of the laboratory; returns the largest diameter and whether
+    all is finite.
+    """
+    motion, constants = grains.motion, grains.constants
+    largest_diameter, finite = 0.0, True
+    for g in range(in_state.size):
+        n = in_state[g]
+        motion[g, X], motion[g, Y] = positions[n, 0], positions[n, 1]
+        motion[g, VX] = velocities[n, 0] + shear_rate * positions[n, 1]
+        motion[g, VY] = velocities[n, 1]
+        constants[g, RADIUS], constants[g, INVERSE_MASS] = radii[n], 1 / masses[n]
+        largest_diameter = max(largest_diameter, 2 * radii[n])
+        for a in range(4):
+            finite &= abs(motion[g, a]) < math.inf
+    return largest_diameter, finite
+
+
+@inline_njit
+def bring_into_cell(grains, side, tilt, shear_rate):
+    """Bring the grains into the cell, at the same peculiar velocities; returns the largest peculiar
+    speed.
+    """
+    motion = grains.motion
+    squared_speed = 0.0
+    for g in range(motion.shape[0]):
+        cx, cy = motion[g, VX] - shear_rate * motion[g, Y], motion[g, VY]
+        row = math.floor(motion[g, Y] / side)
+        motion[g, Y] -= row * side
+        motion[g, X] -= row * tilt * side
+        motion[g, X] -= math.floor((motion[g, X] - tilt * motion[g, Y]) / side) * side
+        motion[g, VX] = cx + shear_rate * motion[g, Y]
+        squared_speed = max(squared_speed, cx * cx + cy * cy)
+    return math.sqrt(squared_speed)
+
+
+@inline_njit
+def kinetic_sums(grains, shear_rate):
+    """Σ m c_x c_x, Σ m c_x c_y and Σ m c_y c_y, just after a search."""
+    motion, constants = grains.motion, grains.constants
+    xx = xy = yy = 0.0
+    for g in range(motion.shape[0]):
+        cx, cy = motion[g, VX] - shear_rate * motion[g, Y], motion[g, VY]
+        mass = 1 / constants[g, INVERSE_MASS]
+        xx += mass * cx * cx
+        xy += mass * cx * cy
+        yy += mass * cy * cy
+    return xx, xy, yy
+
+
+@inline_njit
+def move_grains(t, grains):
+    """Move the grains to their positions at the time t since the search."""
+    motion = grains.motion
+    for g in range(motion.shape[0]):
+        motion[g, X] += motion[g, VX] * t
+        motion[g, Y] += motion[g, VY] * t
+
+
+@njit
+def write_state(in_state, side, tilt, shear_rate, grains, new_positions, new_velocities):
+    """Write the positions, in the cell, and the peculiar velocities of the grains."""
+    motion = grains.motion
+    for g in range(in_state.size):
+        n = in_state[g]
+        new_positions[n, 0], new_positions[n, 1] = image_in_cell(
+            motion[g, X], motion[g, Y], side, tilt
+        )
+        new_velocities[n, 0] = motion[g, VX] - shear_rate * motion[g, Y]
+        new_velocities[n, 1] = motion[g, VY]
