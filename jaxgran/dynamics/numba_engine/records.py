@@ -16,24 +16,13 @@ from jaxgran.dynamics.numba_engine.layout import (
     IMPULSE,
     NX,
     NY,
-    RECORD_APPROACH,
     RECORD_CONTACTS,
-    RECORD_CX,
-    RECORD_CY,
-    RECORD_DISTANCE,
     RECORD_HEAD,
-    RECORD_I,
-    RECORD_IMPULSE,
-    RECORD_J,
-    RECORD_NX,
-    RECORD_NY,
     RECORD_OF_CONTACT,
     RECORD_OF_GRAIN,
     RECORD_SOLVED,
     RECORD_STEP,
     RECORD_TILT,
-    RECORD_X,
-    RECORD_Y,
     SECOND,
     VX,
     VY,
@@ -47,7 +36,7 @@ remap_tilt = CELL["remap_tilt"]
 @njit
 def record_flight(record, step, solved, tilt, t, shear_rate, grains, in_state):
     """Record the grains at the time t since the search, without contacts; ``solved``: whether those
-    have been dealt with.
+    have been.
     """
     motion = grains.motion
     record[RECORD_STEP], record[RECORD_SOLVED], record[RECORD_CONTACTS] = step, solved, 0.0
@@ -55,9 +44,8 @@ def record_flight(record, step, solved, tilt, t, shear_rate, grains, in_state):
     for g in range(in_state.size):
         at = RECORD_HEAD + RECORD_OF_GRAIN * in_state[g]
         y = motion[g, Y] + motion[g, VY] * t
-        record[at + RECORD_X], record[at + RECORD_Y] = motion[g, X] + motion[g, VX] * t, y
-        record[at + RECORD_CX] = motion[g, VX] - shear_rate * y
-        record[at + RECORD_CY] = motion[g, VY]
+        record[at], record[at + 1] = motion[g, X] + motion[g, VX] * t, y
+        record[at + 2], record[at + 3] = motion[g, VX] - shear_rate * y, motion[g, VY]
 
 
 @njit
@@ -67,9 +55,6 @@ def record_contacts(record, contacts, one_plus_alpha, in_state, network):
     record[RECORD_SOLVED], record[RECORD_CONTACTS] = 1.0, contacts
     for c in range(contacts):
         at = RECORD_HEAD + RECORD_OF_GRAIN * in_state.size + RECORD_OF_CONTACT * c
-        record[at + RECORD_I] = in_state[ends[FIRST, c]]
-        record[at + RECORD_J] = in_state[ends[SECOND, c]]
-        record[at + RECORD_NX], record[at + RECORD_NY] = rows[NX, c], rows[NY, c]
-        record[at + RECORD_APPROACH] = rows[APPROACH, c]
-        record[at + RECORD_DISTANCE] = rows[DISTANCE, c]
-        record[at + RECORD_IMPULSE] = one_plus_alpha * rows[IMPULSE, c]
+        record[at], record[at + 1] = in_state[ends[FIRST, c]], in_state[ends[SECOND, c]]
+        record[at + 2], record[at + 3], record[at + 4] = rows[NX, c], rows[NY, c], rows[APPROACH, c]
+        record[at + 5], record[at + 6] = rows[DISTANCE, c], one_plus_alpha * rows[IMPULSE, c]
