@@ -1,10 +1,11 @@
-"""How cost and memory grow with the number of grains, and cost with the time step.
+"""How cost and memory grow with the number of grains, cost with the time step, and the cost of a
+collision with both.
 
 Every size of a flow is measured in its own process, with its peak resident memory. Seconds are CPU
 time, which does not count what else runs on a machine. The exponent of each growth is a
 least-squares fit to the logarithms.
 
-    python -m benchmarks scaling           # up to 1e6 grains; 4 minutes
+    python -m benchmarks scaling           # up to 1e6 grains; 6 minutes
     python -m benchmarks scaling --quick   # up to 1e4 grains; most of it compilation
     python -m benchmarks scaling --grains 100000   # one flow, for a strain of 0.1, as JSON
 """
@@ -29,6 +30,10 @@ TIMESTEPS, QUICK_TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5), (1e-2, 
 LARGE_FLOW = (0.8, 0.6)  # restitution, packing fraction
 DENSE_FLOW = (0.5, 0.8)
 STRAIN = 0.1  # of a timing
+COLLIDING_FLOW = (0.9, 0.6)
+COLLIDING_GRAINS, QUICK_COLLIDING_GRAINS = (256, 2_048, 16_384, 108_000), (256, 2_048)
+COLLISION_TIMESTEPS = (1e-3, 1e-4, 1e-5, 1e-6)
+FEW_COLLISIONS = 40_000  # of a timing, or two a grain in larger flows
 REPEATS = 5
 LINEAR = (
     1_000,
@@ -44,9 +49,11 @@ def run(output: Output, grains: int | None = None) -> None:
         print(json.dumps(large_flow(grains)))
         return
     sizes, dts = (QUICK_GRAINS, QUICK_TIMESTEPS) if output.quick else (GRAINS, TIMESTEPS)
+    colliding = QUICK_COLLIDING_GRAINS if output.quick else COLLIDING_GRAINS
     rows = {
         "grains": [in_own_process(n) for n in sizes],
         "timestep": [row for at in (LARGE_FLOW, DENSE_FLOW) for row in timesteps(at, dts)],
+        "collision": [row for n in colliding for row in collisions(n)],
     }
     fits = exponents(rows)
     report(rows, fits)
@@ -128,6 +135,35 @@ def timesteps(at: tuple[float, float], dts: tuple[float, ...]) -> list[dict[str,
             row
             | {"solves per step": float(tally.solves / tally.steps), "contacts per solve": contacts}
         )
+    return rows
+
+
+def collisions(grains: int) -> list[dict[str, float]]:
+    """CPU time of a collision against the time step, in samples of about as many collisions each;
+    the cost of a call without a step is taken off.
+    """
+    flow = flow_of_arrays(jg.ShearFlow(grains, *COLLIDING_FLOW, 1e-3))
+    state = jg.prepare(flow, jax.random.key(2), equilibrate=2.0)
+    compiled = jax.jit(jg.advance).lower(flow, state, jnp.int32(1)).compile()
+    state, _, tally = timed(compiled, flow, state, STRAIN)
+    strain = STRAIN * max(FEW_COLLISIONS, 2 * grains) / float(tally.collisions)
+    rows = []
+    for dt in COLLISION_TIMESTEPS:
+        shorter = replace(flow, timestep=jnp.asarray(dt))
+        state, _, _ = timed(compiled, shorter, state, strain)
+        _, none, _ = timed(compiled, shorter, state, 0.0)
+        _, seconds, tally = timed(compiled, shorter, state, strain)
+        each = (seconds["cpu"] - none["cpu"]) / float(tally.collisions)
+        rows.append(
+            {
+                "grains": grains,
+                "timestep": dt,
+                "collisions": float(tally.collisions),
+                "microseconds per collision": float(f"{1e6 * each:.3g}"),
+                "seconds of a call without a step": none["cpu"],
+            }
+        )
+        print(rows[-1], flush=True)
     return rows
 
 

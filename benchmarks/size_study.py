@@ -266,8 +266,7 @@ def measure(plan: Plan, folder: Path, largest: int) -> None:
                 alpha, nu, _ = plan.flows[k]
                 print(
                     f"{done} of {total}: restitution {alpha:g}, packing fraction {nu:g}, {grains} "
-                    "grains, "
-                    f"{seconds:.0f} s",
+                    f"grains, {seconds:.0f} s",
                     flush=True,
                 )
 

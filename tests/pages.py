@@ -24,9 +24,8 @@ MARKUP = (
 
 _OPTIONS = (
     "--headless=new --no-sandbox --disable-gpu --disable-quic --no-first-run "
-    "--disable-background-networking "
-    "--disable-component-update --disable-sync --hide-scrollbars --window-size=1400,1400 "
-    "--force-device-scale-factor=1"
+    "--disable-background-networking --disable-component-update --disable-sync --hide-scrollbars "
+    "--window-size=1400,1400 --force-device-scale-factor=1"
 )
 
 

@@ -125,8 +125,7 @@ def instants(points: tuple, sizes: tuple) -> Iterator[Made]:
                     state = _advanced(flow, state, jnp.int32(1))
                 words = (
                     f"N = {grains}, restitution {restitution:g}, packing fraction "
-                    f"{packing_fraction:g}, "
-                    f"dt = {timestep:g}, number {number}"
+                    f"{packing_fraction:g}, dt = {timestep:g}, number {number}"
                 )
                 yield Made("flow", words, compact(contacts, np.asarray(state.grains.masses)))
 

@@ -142,9 +142,8 @@ def fit_trajectory(
     if not misfit[-1] <= 1 + 5 * np.sqrt(2 / freedom):
         raise InputError(
             "the windows must follow from one restitution within the noise, and χ² is "
-            f"{misfit[-1]:.3g} per degree of "
-            "freedom: take shorter windows, another first guess, more iterations, or the true "
-            "noise."
+            f"{misfit[-1]:.3g} per degree of freedom: take shorter windows, another first guess, "
+            "more iterations, or the true noise."
         )
     found = _start_of(start, noises, unknowns)
     return TrajectoryFit(
@@ -161,8 +160,7 @@ def _require_short(sizes: Array) -> None:
     if not worst <= HORIZON:
         raise InputError(
             f"steps must be fewer: in some window the rms of ∂(position)/∂α is {worst:.2g} "
-            "diameters, and beyond "
-            f"{HORIZON:g} derivatives lose their meaning."
+            f"diameters, and beyond {HORIZON:g} derivatives lose their meaning."
         )
 
 

@@ -79,8 +79,7 @@ def fallback_message() -> str:
     )
     return (
         f"the cache folder {str(users_folder())!r} cannot be written "
-        f"({why_unwritable(users_folder())}), so {instead}; "
-        "XDG_CACHE_HOME may name another."
+        f"({why_unwritable(users_folder())}), so {instead}; XDG_CACHE_HOME may name another."
     )
 
 

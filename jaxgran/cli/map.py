@@ -88,8 +88,7 @@ def require_new_figures(output: Path, format: FileFormat) -> None:
         for name in sorted({f"{output.stem}_{figure}.{format}" for figure in FIGURES} & {*names}):
             raise InputError(
                 f"the figure {short_repr(str(output.with_name(name)))} already exists; pass "
-                "`overwrite=True` to "
-                "replace it.",
+                "`overwrite=True` to replace it.",
                 field="output",
             )
 

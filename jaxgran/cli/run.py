@@ -35,8 +35,7 @@ RUN_EXAMPLES = {
     "A movie of it, about a hundred frames": "jaxgran run --restitution 0.1 --packing-fraction 0.8 "
     "--movie flow.gif",
     "All its frames for other programs, every 0.01 of strain": "jaxgran run --restitution 0.5 "
-    "--packing-fraction 0.7 "
-    "--trajectory flow.gsd --frame-strain 0.01",
+    "--packing-fraction 0.7 --trajectory flow.gsd --frame-strain 0.01",
 }
 
 
@@ -44,8 +43,7 @@ RUN_OPTIONS = {
     **of_map("run"),
     "trajectory": Option(
         "GSD file of the flow, frame by frame. Recording frames splits the run at different steps, "
-        "so averages change "
-        "within their errors.",
+        "so averages change within their errors.",
         Path,
         example="FILE.gsd",
     ),

@@ -10,8 +10,7 @@ from jaxgran.reference.validity import COLUMNS, Validity, validity
 
 WHERE_EXAMPLES = {
     "Does kinetic theory hold at a restitution and a packing fraction": "jaxgran where "
-    "--restitution 0.7 "
-    "--packing-fraction 0.6",
+    "--restitution 0.7 --packing-fraction 0.6",
     "The same for a program": "jaxgran where --restitution 0.7 --packing-fraction 0.6 --json",
 }
 WHERE_OPTIONS = {

@@ -2,13 +2,13 @@
 iteration by.
 
 W of a network is never stored: Hᵀ gathers the impulses of the contacts on their grains, H reads the
-relative normal velocities that follow. Two diagonals D stand for it in the ``projected_methods``:
+relative normal velocities that follow. Two diagonals:
 
-- ``diagonal``: W_cc = 1/m_i + 1/m_j. The classical choice; nothing bounds W by it, and networks
-  make it diverge.
-- ``spectral_bound``: λ(A_i)/m_i + λ(A_j)/m_j with λ(A_b) the largest eigenvalue of A_b = Σ n nᵀ
-  over the contacts of grain b, a 2×2 matrix. For any vector x, xᵀWx = Σ_b |Σ_c ±n x_c|²/m_b ≤ Σ_b
-  λ(A_b)/m_b Σ_{c∋b} x_c² = xᵀDx, so W ⪯ D.
+- ``diagonal``: W_cc = 1/m_i + 1/m_j, which scales residuals. As D of a projected method it is the
+  classical choice; nothing bounds W by it, and the iteration diverges in networks.
+- ``spectral_bound``, the D of the ``projected_methods``: λ(A_i)/m_i + λ(A_j)/m_j with λ(A_b) the
+  largest eigenvalue of A_b = Σ n nᵀ over the contacts of grain b, a 2×2 matrix. For any vector x,
+  xᵀWx = Σ_b |Σ_c ±n x_c|²/m_b ≤ Σ_b λ(A_b)/m_b Σ_{c∋b} x_c² = xᵀDx, so W ⪯ D.
 
 An isolated pair has D = W in both.
 
@@ -71,7 +71,7 @@ def delassus_product(
 
 @singledispatch
 def diagonal(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
-    """Diagonal of W; one in unused slots, as in both, so that it can be divided by."""
+    """Diagonal of W; one in unused slots, so that it can be divided by."""
     return jnp.where(contacts.used, contacts.inverse_mass_i + contacts.inverse_mass_j, 1)
 
 

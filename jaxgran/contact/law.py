@@ -1,7 +1,7 @@
-"""The law of a contact: arithmetic that both engines share.
+"""The law of a contact: arithmetic of the contacts, the solver and the flights.
 
 These functions take numbers or arrays and have no branches on values. The engine ``Jax`` calls them
-with arrays of JAX; the numba engine compiles the same source for numbers
+with arrays of JAX; the numba engine compiles the source of those that it shares for numbers
 (``dynamics.numba_engine.compilation``). What branches, such as the search for the next contact or a
 solver, is written for each engine, and tests compare them.
 
@@ -10,7 +10,7 @@ s the separation, u the relative velocity in the laboratory and d the sum of the
 along the flight is f(t) = |s + u t|² − d² = |u|² t² + 2 s·u t + |s|² − d².
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from jax.numpy import ceil, maximum, sqrt, where
 from jaxtyping import Array
@@ -19,7 +19,7 @@ from jaxgran.model.status import DEEP_OVERLAP
 
 Number = Any  # a number, or an array of them
 
-# Step length of the method of Barzilai and Borwein, in units of that of Nesterov's
+# Longest step length of the method of Barzilai and Borwein, in units of that of Nesterov's
 LONGEST_STRIDE = 1e4
 WINDOW = 100  # iterations after which the progress of that method is judged
 PROGRESS = 0.5  # factor by which the best residual must have fallen within a window
@@ -48,10 +48,9 @@ def overlaps_within(
       look_ahead: θ·dt.
     """
     approaching = closing < 0
-    before_closest = -closing < squared_speed * look_ahead
-    t = where(
-        approaching & before_closest, -closing / where(approaching, squared_speed, 1), look_ahead
-    )
+    closest = -closing / where(approaching, squared_speed, 1)
+    is_sooner = approaching & (-closing < squared_speed * look_ahead)
+    t = where(is_sooner, closest, look_ahead)
     return excess + t * (2 * closing + t * squared_speed) <= 0, approaching
 
 
@@ -135,6 +134,35 @@ def largest_eigenvalue(xx: Number, xy: Number, yy: Number) -> Number:
     return (xx + yy + sqrt((xx - yy) * (xx - yy) + 4 * xy * xy)) / 2
 
 
+class ContactTerms(NamedTuple):
+    """What one contact adds to the running sums: by name, the rows of ``dynamics.tally`` for
+    contacts, in their order, and xx, xy and yy of symmetric tensors.
+    """
+
+    impulse: Number
+    binary_impulse: Number
+    contact_moment_xx: Number
+    contact_moment_xy: Number
+    contact_moment_yy: Number
+    binary_moment_xx: Number
+    binary_moment_xy: Number
+    binary_moment_yy: Number
+    cluster_moment_xx: Number
+    cluster_moment_xy: Number
+    cluster_moment_yy: Number
+    dissipation: Number
+    complementarity: Number
+    contacts: Number
+    loaded_contacts: Number
+    collisions: Number
+    overlap: Number
+    deep_contacts: Number
+    binary_speed_moment_xx: Number
+    binary_speed_moment_xy: Number
+    binary_speed_moment_yy: Number
+    binary_dissipation: Number
+
+
 def contact_terms(
     nx: Number,
     ny: Number,
@@ -149,9 +177,8 @@ def contact_terms(
     used: Number,
     loaded: Number,
     approaching: Number,
-) -> tuple:
-    """What one contact adds to the running sums, in the order of the rows of ``dynamics.tally`` for
-    contacts.
+) -> ContactTerms:
+    """What one contact adds to the running sums.
 
     Args:
       nx, ny, distance: unit normal and distance of the centres, in σ.
@@ -160,33 +187,34 @@ def contact_terms(
       half_change: half its change by the impulses, (u⁺ − u⁻)/2.
       one_plus_alpha: 1 + α.
       impulse, binary_impulse: p = (1 + α) p₀, and the same if the collision were binary.
-      clustered: the impulse p where the contact is in a cluster, otherwise 0. used, loaded,
-        approaching: 1 where it is a contact, carries an impulse, approaches; otherwise 0.
+      clustered: the impulse p where the contact is in a cluster, otherwise 0.
+      used, loaded, approaching: 1 where it is a contact, carries an impulse, approaches; otherwise
+        0.
     """
     xx, xy, yy = nx * nx * distance, nx * ny * distance, ny * ny * distance
     # The impulse is zero where the contact does not approach
-    binary_speed = -binary_impulse * approach
-    return (
-        impulse,
-        binary_impulse,
-        impulse * xx,
-        impulse * xy,
-        impulse * yy,
-        binary_impulse * xx,
-        binary_impulse * xy,
-        binary_impulse * yy,
-        clustered * xx,
-        clustered * xy,
-        clustered * yy,
-        -impulse * (approach + half_change),
-        impulse * (one_plus_alpha / 2 * approach + half_change),
-        used,
-        loaded,
-        approaching,
-        overlap,
-        where(overlap > DEEP_OVERLAP, used, 0),
-        binary_speed * xx,
-        binary_speed * xy,
-        binary_speed * yy,
-        (1 - one_plus_alpha / 2) * binary_speed,
+    binary_power = -binary_impulse * approach
+    return ContactTerms(
+        impulse=impulse,
+        binary_impulse=binary_impulse,
+        contact_moment_xx=impulse * xx,
+        contact_moment_xy=impulse * xy,
+        contact_moment_yy=impulse * yy,
+        binary_moment_xx=binary_impulse * xx,
+        binary_moment_xy=binary_impulse * xy,
+        binary_moment_yy=binary_impulse * yy,
+        cluster_moment_xx=clustered * xx,
+        cluster_moment_xy=clustered * xy,
+        cluster_moment_yy=clustered * yy,
+        dissipation=-impulse * (approach + half_change),
+        complementarity=impulse * (one_plus_alpha / 2 * approach + half_change),
+        contacts=used,
+        loaded_contacts=loaded,
+        collisions=approaching,
+        overlap=overlap,
+        deep_contacts=where(overlap > DEEP_OVERLAP, used, 0),
+        binary_speed_moment_xx=binary_power * xx,
+        binary_speed_moment_xy=binary_power * xy,
+        binary_speed_moment_yy=binary_power * yy,
+        binary_dissipation=(1 - one_plus_alpha / 2) * binary_power,
     )

@@ -14,7 +14,8 @@ from jaxgran.model.cell import relative_velocity
 from jaxgran.model.grains import Grains
 from jaxgran.model.indexing import taken
 
-MOST_CONTACTS = 3  # of a grain: the contacts of discs form a planar graph
+# In all over the number of grains: contacts of discs in a periodic cell form a graph on a torus
+MOST_CONTACTS = 3
 
 
 @jax.tree_util.register_dataclass

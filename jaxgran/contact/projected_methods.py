@@ -1,18 +1,16 @@
 """The projected methods: how one iterate of a contact solve follows from those before it.
 
-All of them take projected steps p ← max(0, y − τ D⁻¹(W y + b)) from a point y, with a diagonal D of
-``delassus`` in place of the operator W, and cost one product with W each. They differ in D, in y,
-and in the step length τ:
+All of them take projected steps p ← max(0, y − τ D⁻¹(W y + b)) from a point y, with the diagonal D
+of ``delassus.spectral_bound``, and cost one product with W each. They differ in y and in the step
+length τ:
 
-=================  ===============  ==============================  ================================
-method             diagonal D       starting point y                step length τ
-=================  ===============  ==============================  ================================
-Jacobi             spectral bound   p                               relaxation ω
-Nesterov           spectral bound   p + k/(k+3) (p − p_before)      1; k restarts when the step
-                                                                    turns uphill
-BarzilaiBorwein    spectral bound   p                               curvature along the last step;
-                                                                    guarded
-=================  ===============  ==============================  ================================
+=================  ==============================  =================================================
+method             point y                         step length τ
+=================  ==============================  =================================================
+Jacobi             p                               relaxation ω
+Nesterov           p + k/(k+3) (p − p_before)      1; k restarts when the step turns uphill
+BarzilaiBorwein    p                               curvature along the last step; guarded
+=================  ==============================  =================================================
 
 Where W ⪯ D, a Jacobi step lowers ½pᵀWp + bᵀp for every ω < 2, and Nesterov's method converges at τ
 = 1. With diag(W) neither holds (``benchmarks/stability.py``).
@@ -64,7 +62,7 @@ class ProjectedMethod:
     field       shape  unit  meaning
     ==========  =====  ====  =======================================================================
     tolerance   ()     –     relative residual ‖min(diag(W) p, W p + b)‖ / ‖min(b, 0)‖ to reach,
-                             1e-12 to 0.1
+                             1e-12 to 0.1; ``law.residual_target`` adds what is lost in rounding
     max_steps   ()     –     largest number of iterations; the best iterate is then returned, with a
                              status
     ==========  =====  ====  =======================================================================

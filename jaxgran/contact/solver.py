@@ -79,10 +79,8 @@ def solve(
     bound = solver.bound(contacts, grains)
     closing = jnp.minimum(b, 0)
     scale = jnp.sqrt(dot(closing, closing))
-    tolerance, max_steps = (
-        jnp.asarray(solver.tolerance, b.dtype),
-        jnp.asarray(solver.max_steps, jnp.int32),
-    )
+    tolerance = jnp.asarray(solver.tolerance, b.dtype)
+    max_steps = jnp.asarray(solver.max_steps, jnp.int32)
     target = residual_target(scale, tolerance, shear_rate, jnp.finfo(b.dtype).eps)
 
     def as_numbers(values: Any) -> Any:
@@ -91,15 +89,15 @@ def solve(
 
     def iterate(now: _Progress) -> _Progress:
         at, iterations = now.at, now.at.iterations + 1
-        start, step = as_numbers(solver.propose(at))
-        impulses = jnp.maximum(0, start[0] - step * (start[1] + b) / bound)
+        origin, step = as_numbers(solver.propose(at))
+        impulses = jnp.maximum(0, origin[0] - step * (origin[1] + b) / bound)
         response = delassus_product(contacts, impulses, grains)
         point = jnp.stack([impulses, response])
         error = jnp.minimum(w_diagonal * impulses, response + b)
         residual = jnp.sqrt(dot(error, error))
         better = residual < at.best_residual
         best_residual = jnp.where(better, residual, at.best_residual)
-        memory = as_numbers(solver.learn(at, start, point, bound, best_residual))
+        memory = as_numbers(solver.learn(at, origin, point, bound, best_residual))
         new = _Progress(
             at=Iterate(point, at.point, memory, best_residual, iterations),
             residual=residual,
@@ -118,16 +116,14 @@ def solve(
     impulses, response = end.best
 
     def is_jammed():
-        last, moved = (
-            end.at.point
-        )  # the best iterate may be an early one, whose impulses have not grown yet
+        # The best iterate may be an early one, whose impulses have not grown yet.
+        last, moved = end.at.point
         return dot(last, moved) < JAMMED_RESPONSE * -dot(b, last)
 
     capped = active & ~(end.residual <= target)
     jammed = lax.cond(any_replica(capped), is_jammed, lambda: jnp.bool_(False))
-    status = jnp.where(
-        capped, jnp.where(jammed, Status.infeasible, Status.iteration_limit), Status.ok
-    )
+    failure = jnp.where(jammed, Status.infeasible, Status.iteration_limit)
+    status = jnp.where(capped, failure, Status.ok)
     return Solution(
         impulses=impulses,
         response=response,

@@ -87,8 +87,7 @@ def _batch_of(flow: Any, state: Any, *numbers: Any) -> Arguments | None:
     if len(shapes) > 1 or len(max(shapes)) > 1:
         raise InputError(
             "a batch must have one axis of replicas, the same in the flow, the state and all "
-            "numbers, not those of "
-            f"{', '.join(map(str, sorted(shapes)))}."
+            f"numbers, not those of {', '.join(map(str, sorted(shapes)))}."
         )
 
     def with_axis(x: Any, dimensions: int = 0) -> Any:

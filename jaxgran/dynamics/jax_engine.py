@@ -7,7 +7,7 @@ constant, so separations are linear in time, and the step in which some pair nex
 approaching contact is known in advance. The loop jumps there in one evaluation. The trajectory is
 that of the fixed time step; the cost follows the contacts.
 
-Derivatives of a trajectory hold the time steps of its contacts: the numbers of steps flown are
+Derivatives of a trajectory keep its contacts in their time steps: the numbers of steps flown are
 whole and do not change. That is the derivative of what is computed. It is not that of the flow in
 the limit dt → 0, in which a contact comes earlier or later where the grains before it are moved.
 With ``moving_contacts`` every contact that begins in a step adds what a shift of its time by dτ
@@ -83,9 +83,8 @@ def advance_by_jax(
 
     Arguments, derivatives and results are those of ``dynamics.advance``.
     """
-    derivatives = (
-        events is not None or moving_contacts
-    )  # those of a solve of each size would be compiled
+    # For derivatives, one size of a solve is compiled.
+    derivatives = events is not None or moving_contacts
     advance = _advance_of(flow, solver, state, steps)._replace(
         free_flight=free_flight,
         buffers=() if derivatives else contact_buffers(flow.grains),
@@ -129,9 +128,10 @@ def _until_stale(advance: Advance, now: Carry) -> Carry:
         return any_replica(unfinished(advance, now)) & (is_first | ~stale)
 
     begin = jnp.bool_(True), refresh_lists(advance, now)
-    return lax.while_loop(keep_going, lambda at: (jnp.bool_(False), event(advance, at[1])), begin)[
-        1
-    ]
+    _, after = lax.while_loop(
+        keep_going, lambda at: (jnp.bool_(False), event(advance, at[1])), begin
+    )
+    return after
 
 
 def _last(advance: Advance, begin: Carry) -> Carry:
@@ -208,9 +208,7 @@ def count_events(
     """
     require_advance(flow, state, steps)
     require_solver(solver)
-    advance = _advance_of(flow, solver, state, steps)._replace(
-        free_flight=free_flight
-    )  # as with a fixed length
+    advance = _advance_of(flow, solver, state, steps)._replace(free_flight=free_flight)
 
     def keep_going(at: tuple[Array, Carry]) -> Array:
         return any_replica(unfinished(advance, at[1]))

@@ -68,9 +68,9 @@ class Advance(NamedTuple):
     steps: Int[Array, ""]  # to fly in all
     solver: ProjectedMethod
     free_flight: bool | Array = True  # whether steps without an approaching contact are jumped over
-    buffers: tuple[
-        int, ...
-    ] = ()  # contacts for which a solve is compiled, smallest first, beside all pairs
+    # Numbers of contacts for which a solve is compiled, smallest first, beside that of all pairs;
+    # none in loops for derivatives
+    buffers: tuple[int, ...] = ()
     moving_contacts: bool = False  # whether derivatives include that a contact moves in time
     observe: Callable[[State, Contacts, Array], Any] | None = None  # a function of the user's
 
@@ -146,8 +146,8 @@ def closing_speed_bound(
     """Bound on how fast the gap of a pair outside of the near list closes, in σγ̇.
 
     A gap closes no faster than 2 max|c| from the peculiar velocities and γ̇ Δx Δy / r ≤ γ̇ r / 2
-    from the shear, where r ≤ d + skin until a pair from outside the list touches. Within a flight
-    |c| grows by a factor 1 + γ̇ t at most.
+    from the shear. A pair outside of the list has to close the last part of its way, from r = d +
+    skin to r = d. Within a flight |c| grows by a factor 1 + γ̇ t at most.
     """
     cx, cy = lax.stop_gradient(velocities).T  # the choice of pairs has no derivative
     longest = jnp.maximum(LONGEST_FLIGHT, flow.shear_rate * flow.timestep)
@@ -166,7 +166,8 @@ def event(advance: Advance, now: Carry) -> Carry:
     flown = fly(advance, now, jump)
 
     spare = flown.slack - now.closing_speed * flow.activation * flow.timestep
-    expired = spare < -16 * jnp.finfo(spare.dtype).eps * near.skin
+    rounding = 16 * jnp.finfo(spare.dtype).eps * near.skin  # of the slack, summed over flights
+    expired = spare < -rounding
     needs_solve = going & (flown.step < advance.steps) & ~(expired & (jump > 0))
     collided = collide(advance, flown, needs_solve)
 

@@ -4,7 +4,7 @@ follow.
 The fields of ``Tally`` are the table: every row has a shape, a unit, a meaning, and what adds to
 it. While the time loop runs, an engine keeps the sums as plain numbers. Their order follows from
 the table (``LAYOUT``), so no position is written down anywhere. A new sum over contacts is one row
-here and one term of ``contact.law.contact_terms``.
+here and one field, with its value, of ``contact.law.ContactTerms``; both have the same order.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxgran.contact.law import ContactTerms
 from jaxgran.model.batches import equal_values
 from jaxgran.model.indexing import taken
 from jaxgran.model.status import DEEP_SHARE, Status
@@ -184,6 +185,20 @@ def span_of(kind: str) -> slice:
     return slice(places[0].start, places[-1].stop)
 
 
+def _columns(kind: str) -> tuple[str, ...]:
+    """The names of the running sums of one kind, in their order."""
+    rows = [(name, row["shape"]) for name, row in TABLE.items() if row["kind"] == kind]
+    ends = {_TENSOR: ("_xx", "_xy", "_yy"), (): ("",)}
+    return tuple(name + end for name, shape in rows for end in ends[shape])
+
+
+if ContactTerms._fields != _columns(CONTACT):
+    raise TypeError(
+        "ContactTerms must have the fields of the rows of Tally for contacts, in their order: "
+        f"{', '.join(_columns(CONTACT))}."
+    )
+
+
 class RunningSums(NamedTuple):
     """What the time loop of an engine carries, until ``tally`` gives the sums their names.
 
@@ -232,8 +247,10 @@ class RunningSums(NamedTuple):
         return self._replace(instant=instant, read_until=self.duration)
 
     def tally(self, **ends: Array) -> Tally:
-        """The tally; what is known only at the end of an advance is given by name, but the
-        status.
+        """The tally.
+
+        Args:
+          ends: the sums that are known only at the end of an advance, by name, without the status.
         """
         ends = {**ends, "status": self.status}
         return Tally(**{name: ends[name] if name in ends else self._named(name) for name in TABLE})

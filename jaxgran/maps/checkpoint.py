@@ -164,8 +164,7 @@ class Checkpoint:
                 if not resume:
                     raise InputError(
                         f"output {str(self._output)!r} has an unfinished map: pass `resume=True` "
-                        "to continue it, or "
-                        f"remove the folder {str(self.folder)!r}.",
+                        f"to continue it, or remove the folder {str(self.folder)!r}.",
                         field="output",
                     )
                 self._require_same(begun)

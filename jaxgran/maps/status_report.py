@@ -64,8 +64,7 @@ def format_short(data: MapData, points: list[str]) -> str:
     which = "" if data.status.size == 1 else f" at {_some(points)}"
     return (
         f"short sample{which}: less than {FEWEST_CORRELATION_STRAINS:g} correlation strains, so "
-        "its errors may be too "
-        f"small; set `strain={math.ceil(enough)}`."
+        f"its errors may be too small; set `strain={math.ceil(enough)}`."
     )
 
 

@@ -225,7 +225,7 @@ def require_sheared(flow: ShearFlow) -> None:
     require("shear_rate", flow.shear_rate, lambda x: x > 0, words)
 
 
-def one_of(flow: Any, k: int, count: int) -> ShearFlow:
+def flow_of_replica(flow: Any, k: int, count: int) -> ShearFlow:
     """Flow ``k`` of a batch of ``count``, whose numbers are single ones, the same for all, or
     arrays of ``count``.
     """
@@ -234,8 +234,7 @@ def one_of(flow: Any, k: int, count: int) -> ShearFlow:
     if shapes - {(count,)}:
         raise InputError(
             f"numbers of the flow must be single ones or arrays ({count},), one for each key, not "
-            "of the shapes "
-            f"{', '.join(map(str, sorted(shapes)))}."
+            f"of the shapes {', '.join(map(str, sorted(shapes)))}."
         )
     return jax.tree.map(lambda x: np.broadcast_to(x, (count,))[k], flow)
 

@@ -94,8 +94,7 @@ def verdicts(packing_fractions: np.ndarray, restitutions: np.ndarray) -> dict[st
             flows[flow] = {"verdict": one.verdict(), "rows": one.rows()}
     return {
         "about": f"Reference map: {table.made_with}, diameters uniform in σ ± "
-        f"{table.head['polydispersity']} σ; "
-        "± is half of the 95 % interval for a large system.",
+        f"{table.head['polydispersity']} σ; ± is half of the 95 % interval for a large system.",
         "outside": f"The reference map covers α = {first:g} to {last:g} and ν = {loosest:g} to "
         f"{densest:g}.",
         "columns": list(COLUMNS),

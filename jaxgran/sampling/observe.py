@@ -190,9 +190,8 @@ def _observe_step(
     except _NEEDS_VALUES as error:
         raise InputError(
             "observe must compute with jax.numpy, since JAX traces its snapshot, and "
-            f"{_line_of(observe, error)} "
-            "needs the values: jnp.sum and jnp.where take the place of functions of NumPy, float() "
-            "and if."
+            f"{_line_of(observe, error)} needs the values: jnp.sum and jnp.where take the place of "
+            "functions of NumPy, float() and if."
         ) from None
 
 

@@ -45,7 +45,13 @@ from jaxgran.model.checks import (
     require_key,
     require_number,
 )
-from jaxgran.model.flow import ShearFlow, one_of, require_sheared, steps_of_blocks, steps_of_strain
+from jaxgran.model.flow import (
+    ShearFlow,
+    flow_of_replica,
+    require_sheared,
+    steps_of_blocks,
+    steps_of_strain,
+)
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import GIVEN_UP, Status
@@ -306,7 +312,7 @@ def _replicas(
     if shape is None or len(shape) > 1 or shape == (0,):
         require_key(key)
     single, count = shape == (), 1 if not shape else shape[0]
-    flows = [one_of(flow, k, count) for k in range(count)]
+    flows = [flow_of_replica(flow, k, count) for k in range(count)]
     keys = key[None] if single else key
     if grains is None:
         return stack(flows), keys, None, single
@@ -353,8 +359,8 @@ def _advanced(batch: Batch, steps: np.ndarray, advance: AdvanceBatch) -> tuple[B
     """Advance every replica by its own number of time steps; one that is given up stays as it
     is.
     """
-    going_on = batch.status < GIVEN_UP
-    counts = np.where(going_on, steps, 0).astype(np.int32)
+    unfinished = batch.status < GIVEN_UP
+    counts = np.where(unfinished, steps, 0).astype(np.int32)
     state, tally = advance(batch.flow, batch.numerics, batch.state, counts)
     tally = jax.tree.map(np.asarray, tally)
     failed = np.where(

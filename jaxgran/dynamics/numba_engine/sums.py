@@ -79,7 +79,7 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
             1.0 if impulse > 0.0 else 0.0,
             1.0 if approach < 0.0 else 0.0,
         )
-        padded = terms + terms[:_PADS]
+        padded = terms[:] + terms[:_PADS]
         for n in range(_PADDED):
             step_sums[n] += padded[n]
     for n in range(_TERMS):
