@@ -35,10 +35,9 @@ def with_own_batching(function: Callable[..., T]) -> Callable[..., T]:
         if not any(jax.tree.leaves(batched[0])):
             axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
             return _all_batched(jax.vmap(function, axes)(*arguments))
-        batch = _with_axis(size, batched, arguments)
-        return _all_batched(
-            together(*batch) if in_lockstep() else lax.map(lambda replica: one(*replica), batch)
-        )
+        if in_lockstep():
+            return _all_batched(together(*_with_axis(size, batched, arguments)))
+        return _all_batched(_in_turn(one, batched, arguments))
 
     @together.def_vmap
     def of_batches(size: int, batched: Any, *arguments: Any) -> tuple[T, Any]:
@@ -87,6 +86,21 @@ def _completed(values: T, tangents: list[jax.Array]) -> T:
     return structure.unflatten(
         [next(rest) if is_real else zero for is_real, zero in zip(real, zeros, strict=True)]
     )
+
+
+def _in_turn(function: Callable[..., T], batched: Any, arguments: tuple) -> T:
+    """The results for one replica after another. What all have in common stays outside of the
+    loop, so that the compiler knows constants, such as numbers of the solver.
+    """
+    leaves, structure = jax.tree.flatten(arguments)
+    is_batched = jax.tree.leaves(tuple(batched))
+
+    def of_replica(own: list[jax.Array]) -> T:
+        rest = iter(own)
+        each = [next(rest) if mine else x for x, mine in zip(leaves, is_batched, strict=True)]
+        return function(*structure.unflatten(each))
+
+    return lax.map(of_replica, [x for x, mine in zip(leaves, is_batched, strict=True) if mine])
 
 
 def _with_axis(size: int, batched: Any, arguments: tuple) -> tuple:
