@@ -228,7 +228,7 @@ def draw(rows: dict[str, list[dict]], fits: dict[str, float]) -> Figure:
     grains.set_ylabel("CPU time of a unit of strain (s)")
     for (alpha, nu), look in ((DENSE_FLOW, "ks--"), (LARGE_FLOW, "ko-")):
         here = [row for row in rows["timestep"] if (row["alpha"], row["nu"]) == (alpha, nu)]
-        exponent = fits[f"timestep at α = {alpha:g}, ν = {nu:g}"]
+        exponent = round(fits[f"timestep at α = {alpha:g}, ν = {nu:g}"], 1) + 0.0  # no -0.0
         label = rf"$\alpha={alpha:g}$, $\nu={nu:g}$: $\Delta t^{{{exponent:.1f}}}$"
         x, y = ([row[name] for row in here] for name in ("timestep", "cpu seconds per strain"))
         timestep.plot(x, y, look, label=label)
