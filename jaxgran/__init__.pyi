@@ -37,7 +37,8 @@ from .plotting.theory import cluster_shares, theory_errors
 from .reference.law import constitutive_law
 from .reference.validity import validity
 from .sampling.packing import pack
-from .sampling.sample import Sample, sample
+from .sampling.sample import Sample
+from .sampling.sampler import sample
 from .sampling.steady_state import heated, prepare
 
 __version__: str

@@ -47,7 +47,7 @@ from jaxgran.model.status import Status
 from jaxgran.plotting import theory
 from jaxgran.plotting.map_figures import FIGURES
 from jaxgran.plotting.movie import check_movie
-from jaxgran.sampling import sample, steady_state
+from jaxgran.sampling import sampler, steady_state
 from jaxgran.sampling.observe import observed_shapes
 
 GRAINS = 32
@@ -74,7 +74,7 @@ def nothing_runs() -> Iterator[None]:
     """Whatever a public function would compile and run raises ``WouldRun``."""
     with pytest.MonkeyPatch.context() as patch:
         for module, name in (
-            (sample, "_sample"),
+            (sampler, "_sample"),
             (snapshots, "_snapshot_series"),
             (fields, "_fields_at"),
             (steady_state, "prepare_batch"),

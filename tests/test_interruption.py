@@ -16,7 +16,7 @@ from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.numba_engine import ffi
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
-from jaxgran.sampling.sample import sample
+from jaxgran.sampling.sampler import sample
 
 SECOND = 1.0
 FLOW = ShearFlow(GRAINS, 0.7, 0.7, 1e-3)

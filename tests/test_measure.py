@@ -22,7 +22,8 @@ from jaxgran.model.state import State, require_match
 from jaxgran.model.status import DEEP_SHARE, Status
 from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.observe import advance_batch
-from jaxgran.sampling.sample import BLOCKS, Sample, _sample, check_precision, sample
+from jaxgran.sampling.sample import BLOCKS, Sample
+from jaxgran.sampling.sampler import _sample, check_precision, sample
 from jaxgran.sampling.steady_state import Batch, prepare_batch
 
 GRAINS, TIMESTEP, STRAIN = 64, 1e-2, 0.64

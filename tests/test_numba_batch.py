@@ -13,7 +13,7 @@ from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.numba_engine import ffi
 from jaxgran.environment import usable_cores, usable_threads
 from jaxgran.model.flow import ShearFlow
-from jaxgran.sampling.sample import sample
+from jaxgran.sampling.sampler import sample
 
 RESTITUTIONS, FRACTIONS, STEPS = (0.3, 0.7, 0.9), (0.6, 0.7), 500
 

@@ -19,7 +19,8 @@ from jaxgran.dynamics.observed_advance import advance_observed
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
-from jaxgran.sampling.sample import BLOCKS, sample
+from jaxgran.sampling.sample import BLOCKS
+from jaxgran.sampling.sampler import sample
 
 STRAIN = 0.32
 FLOW = ShearFlow(GRAINS, 0.6, 0.7, 1e-3)  # by the numba engine

@@ -23,7 +23,7 @@ from jaxgran.dynamics.batch import over_replicas
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.model.control_flow import in_batch
 from jaxgran.model.state import State
-from jaxgran.sampling import sample as sample_module
+from jaxgran.sampling import sampler
 
 ALPHAS, NUS = jnp.asarray([0.3, 0.5, 0.8]), jnp.asarray([0.5, 0.6, 0.7])
 KEYS = jax.random.split(jax.random.key(0), 4)
@@ -104,10 +104,8 @@ def test_replicas_advance_together_on_an_accelerator_only(
 
 def test_batches_of_any_size_are_compiled_once(states: State, monkeypatch) -> None:
     traced = []
-    original = sample_module._sample_blocks
-    monkeypatch.setattr(
-        sample_module, "_sample_blocks", lambda *x: (traced.append(x), original(*x))[1]
-    )
+    original = sampler._sample_blocks
+    monkeypatch.setattr(sampler, "_sample_blocks", lambda *x: (traced.append(x), original(*x))[1])
     for count in (5, 1, 8):
         many = np.arange(count) % 3
         _, found = jg.sample(FLOWS[many], states[many], 0.1, blocks=3)

@@ -66,7 +66,8 @@ from jaxgran.sampling.correlation_strain import (
 from jaxgran.sampling.observe import AdvanceBatch, advance_batch
 from jaxgran.sampling.packing import pack, require_room
 from jaxgran.sampling.prediction import predicted
-from jaxgran.sampling.sample import BLOCKS, Sample, check_precision, relative_error
+from jaxgran.sampling.sample import BLOCKS, Sample, relative_error
+from jaxgran.sampling.sampler import check_precision
 from jaxgran.sampling.timestep import (
     bounded_coarse_timestep,
     check_timestep,

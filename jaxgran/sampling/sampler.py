@@ -1,0 +1,251 @@
+"""Shears flows, one or a batch, and samples them in blocks of strain."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Int
+
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
+from jaxgran.dynamics.advance import advance_blocks
+from jaxgran.dynamics.batch import checked_batch, shear_batch
+from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
+from jaxgran.dynamics.interruption import waited
+from jaxgran.dynamics.tally import Tally
+from jaxgran.model.checks import (
+    InputError,
+    as_array,
+    is_traced,
+    require,
+    require_whole,
+    short_repr,
+    two_digits,
+)
+from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
+from jaxgran.model.state import State, require_match, require_state
+from jaxgran.sampling.averages import averages
+from jaxgran.sampling.correlation_strain import flow_correlation_strain, length_status
+from jaxgran.sampling.observe import Observable, advance_and_observe
+from jaxgran.sampling.sample import BLOCKS, Sample
+
+MOST_BLOCKS = 10**6
+_SMALLEST_MOTION = 20  # of a grain at velocity γ̇σ in one step, in roundings of a position
+
+
+def sample(
+    flow: ShearFlow,
+    state: State,
+    strain: float | Array,
+    blocks: int = BLOCKS,
+    observe: Observable | None = None,
+    callback: Callable[[State, Sample], Any] | None = None,
+    *,
+    solver: ProjectedMethod = DEFAULT_SOLVER,
+    engine: Engine | None = None,
+) -> tuple[State, Sample]:
+    """Shear a flow, or a batch of flows, and average its observables; ``jit``, ``vmap`` and
+    ``lax.map`` apply.
+
+    A batch is a flow or a state whose arrays have a leading (replicas,) axis; what lacks it is the
+    same for all. Each replica has the results of its own call. ``jax.vmap`` of this function does
+    the same. A batch is shared out to all cores of a processor, and batches of any size need one
+    compilation there.
+
+    The numba engine takes all blocks in one call, unless there is ``observe`` or ``callback``. Then
+    every block begins with a new list of near pairs, and its trajectory differs by rounding, which
+    grows as in any chaotic flow.
+
+    The result of ``observe`` is averaged over **every** time step, in the same run (see
+    ``observer``). A few instants do not suffice for contact forces: at a short time step, most
+    instants of a collisional flow have no contact with a force. A function of the forces, which are
+    ``impulses / timestep``, is averaged exactly. Positions and velocities are observed once a free
+    flight; their averages are accurate up to the strain of a flight, about 1e-3.
+
+    Args:
+      flow: parameters of the state, with its packing fraction and polydispersity; or those
+        (replicas,) of a batch.
+      state: the flow at the beginning, usually from ``prepare``; or a batch of states.
+      strain: strain γ̇t to sample, rounded to whole time steps; for a batch also (replicas,). A new
+        value does not recompile.
+      blocks: number of equal parts of the strain, static; a tally is kept for each.
+      observe: a function of a ``Snapshot`` that returns a pytree of arrays to average. It is
+        static: each new function, such as a lambda that is written anew, is compiled, so define it
+        once. Beside the numba engine this takes about 2 s. Where the engine ``Jax`` runs, or the
+        function uses values from outside that JAX traces, that engine is compiled with it, in about
+        20 s. The next process loads the program. The contacts are those of a step with an
+        approaching contact, before the impulses act; other steps have none. The size of their
+        buffers varies, so ``observe`` must return sums over contacts or over grains.
+      callback: called after each block with the state and the sample so far; if its result is true,
+        the sample ends. One block is then compiled at a time, and neither batches nor JAX
+        transformations apply.
+      solver: solves the contacts of each step, by default ``BarzilaiBorwein()``. New numbers in it
+        do not recompile.
+      engine: ``Jax()`` or ``Numba()``; None for the fastest that can do this, see ``advance``.
+
+    Returns:
+      The final state and the sample; those of a batch have a leading (replicas,) axis.
+
+    Raises:
+      InputError: (a ValueError) the axes of a batch differ; the state has another packing fraction
+        or polydispersity than the flow; the flow is not sheared; the strain is not a positive
+        number, is shorter than one time step a block, or is longer than 2**31 - 1 time steps;
+        positions in float32 cannot resolve the time step; the result of ``observe`` is not summed
+        over contacts; or the engine cannot do this.
+
+    Examples:
+      The fabric of the contacts that carry a force:
+
+      >>> import jaxgran as jg
+      >>> flow = ShearFlow(grains=32, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
+      >>> state = jg.prepare(flow, jax.random.key(0), equilibrate=0.4)
+      >>> def observe(snapshot):
+      ...     normals = snapshot.contacts.normals
+      ...     loaded = (snapshot.impulses > 0).astype(normals.dtype)
+      ...     fabric = jnp.einsum("c,ca,cb->ab", loaded, normals, normals)
+      ...     return {"fabric": fabric, "contacts": jnp.sum(loaded)}
+      >>> state, measured = sample(flow, state, 0.4, observe=observe)
+      >>> fabric, error = measured.observed(lambda mean: mean["fabric"] / mean["contacts"])
+      >>> round(float(fabric.trace()), 6), bool(measured.errors()["pressure"] > 0)
+      (1.0, True)
+    """
+    require_whole("blocks", blocks, 1, MOST_BLOCKS, "as a tally is kept for each")
+    strain = as_array(strain)
+    require("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
+    batch = checked_batch(partial(_require_sheared_state, blocks), flow, state, strain)
+    numerics = checked_numerics(solver, engine)
+    for name, function in (("observe", observe), ("callback", callback)):
+        if function is not None and not callable(function):
+            raise InputError(f"{name} must be a function or None, not {short_repr(function)}.")
+    if callback is None:
+        if batch is None:
+            return waited(_sample(flow, state, strain, numerics, blocks, observe))
+        option = "" if observe is None else "observe"
+        return shear_batch(_sample, numerics, batch, (blocks, observe), option)
+    if batch or is_traced(flow, numerics, state, strain):
+        raise InputError(
+            "callback must be None for a batch, and where a sample is transformed, as by jax.jit."
+        )
+    return _sample_with_callback(
+        flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe, callback
+    )
+
+
+def _require_sheared_state(blocks: int, flow: ShearFlow, state: State, strain: Any) -> None:
+    """Raise an InputError unless a flow can shear a state by a strain of so many blocks."""
+    require_state(flow, state)
+    require_strain(flow, strain, blocks)
+    require_match(flow, state)
+    check_precision(flow, state)
+
+
+@partial(jax.jit, static_argnames=("blocks", "observe"))
+def _sample(
+    flow: ShearFlow,
+    state: State,
+    strain: Array,
+    numerics: Numerics,
+    blocks: int,
+    observe: Observable | None = None,
+) -> tuple[State, Sample]:
+    end, measured = _sample_blocks(
+        flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe
+    )
+    return end, _with_length(measured, end)
+
+
+def _steps_of_blocks(flow: ShearFlow, strain: float | Array, blocks: int) -> Int[Array, " blocks"]:
+    return steps_of_blocks(steps_of_strain(flow, strain), blocks)
+
+
+def _sample_blocks(
+    flow: ShearFlow,
+    numerics: Numerics,
+    state: State,
+    steps: Int[Array, " blocks"],
+    observe: Observable | None,
+) -> tuple[State, Sample]:
+    """The final state and the sample of blocks with the given numbers of time steps."""
+
+    def block(state: State, steps: Array) -> tuple[State, Tally]:
+        return advance_and_observe(flow, numerics, state, steps, observe)
+
+    if observe is None:
+        state, tally = advance_blocks(flow, numerics, state, steps)
+    else:
+        state, tally = lax.scan(block, state, steps)
+    shear_rate = jnp.asarray(flow.shear_rate, state.side.dtype)
+    return state, Sample(tally, state.side**2, shear_rate, flow.grains)
+
+
+_sample_one_block = jax.jit(_sample_blocks, static_argnames="observe")
+
+
+def _sample_with_callback(
+    flow: ShearFlow,
+    numerics: Numerics,
+    state: State,
+    steps_of_blocks: Int[Array, " blocks"],
+    observe: Observable | None,
+    callback: Callable,
+) -> tuple[State, Sample]:
+    """The sample, block by block, with a call of ``callback`` after each."""
+    parts: list[Sample] = []
+    for steps in np.asarray(steps_of_blocks):
+        measured = _sample_one_block(flow, numerics, state, jnp.asarray([steps]), observe)
+        state, part = waited(measured)
+        parts.append(part)
+        if callback(state, _with_length(_joined(parts), state)):
+            break
+    return state, _with_length(_joined(parts), state)
+
+
+def _with_length(measured: Sample, state: State) -> Sample:
+    """The sample with the status ``short_sample`` in its last block where it is short, see
+    ``correlation_strain``.
+    """
+    tally, grains = measured.tally, measured.grains
+    total = averages(tally.total(axis=0), measured.area, grains, measured.shear_rate)
+    mass = jnp.sum(state.grains.masses)
+    correlation = flow_correlation_strain(total, grains, mass, measured.area, measured.shear_rate)
+    status = length_status(jnp.sum(tally.duration) * measured.shear_rate, correlation)
+    last = jnp.maximum(tally.status[-1], jnp.asarray(status, tally.status.dtype))
+    return replace(
+        measured, tally=replace(tally, status=jnp.asarray(tally.status).at[-1].set(last))
+    )
+
+
+def _joined(parts: list[Sample]) -> Sample:
+    """One sample from successive samples of the same flow."""
+    tallies = (part.tally for part in parts)
+    tally = jax.tree.map(
+        lambda *x: jnp.asarray(np.concatenate([np.asarray(one) for one in x])), *tallies
+    )
+    return replace(parts[-1], tally=tally)
+
+
+def check_precision(flow: ShearFlow, state: State) -> None:
+    """Raise an InputError if positions cannot resolve the time step; traced values are not checked.
+
+    In one step a grain at velocity γ̇σ moves by γ̇ dt σ. In float32 a position in a cell of 20 σ is
+    rounded to 2e-6 σ.
+
+    The engines add the motion to displacements since the last build of the lists, which are far
+    smaller. So a flow is wrong only if a step moves a pair by less than the rounding of its
+    separation, 1e-7 σ. But summed times drift by 1e-3, and programs that compare the positions of
+    two states see their rounding. So the limit is that of positions.
+    """
+    if is_traced(flow.timestep, flow.shear_rate, state.side):
+        return
+    rounding = np.finfo(state.positions.dtype).eps * float(np.asarray(state.side).max())
+    least = _SMALLEST_MOTION * rounding
+    if float(np.min(np.asarray(flow.timestep) * np.asarray(flow.shear_rate))) < least:
+        raise InputError(
+            f"timestep must be at least {two_digits(least, up=True)} / shear_rate for positions in "
+            f"{state.positions.dtype}: "
+            'use a longer one, or float64 (jax.config.update("jax_enable_x64", True)).'
+        )
