@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from synthetic import random_tally
 
+import jaxgran as jg
 from jaxgran.model.display import with_error
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.sample import BLOCKS, Sample
@@ -27,6 +28,16 @@ def test_the_line_is_short_whatever_stands_in_the_place_of_a_number(value) -> No
     ]
     assert all(repr(one).startswith(type(value).__name__) and "\n" not in repr(one) for one in seen)
     assert len(repr(value)) < 700
+
+
+def test_answers_of_the_reference_map_are_shown_in_one_line() -> None:
+    law, verdict = jg.constitutive_law(), jg.validity(0.6, [0.5, 0.65])
+    assert repr(law) == "ConstitutiveLaw(restitution=0.05 to 0.98, packing_fraction=0.1 to 0.83)"
+    one = law(0.6, 0.65)
+    assert f"pressure={with_error(one.pressure, one.pressure_ci95)}, " in repr(one)
+    for value in (one, law(0.6, [0.5, 0.65]), verdict, verdict.at(0)):
+        assert repr(value).startswith(type(value).__name__) and "ci95" not in repr(value)
+        assert len(repr(value)) < 400 and "\n" not in repr(value)
 
 
 @given(st.floats(1e-12, 1e12), st.floats(1e-12, 1e12), st.sampled_from([-1, 1]))

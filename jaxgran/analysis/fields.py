@@ -57,10 +57,9 @@ class Fields:
     heat_flux       (points, 2)     mσγ̇³     J_Q = ½ Σ m |v − V|² (v − V) G + Σ σ F·((v̄_i +
                                              v̄_j)/2 − V) ∫G, with v̄ the
                                              mean of the velocities before and after the collision
-    dissipation     (points,)       mγ̇³      ζ: energy lost in contacts, half of each loss at
-                                             either grain; negative
-                                             where a contact gains energy because its neighbours
-                                             compress it
+    dissipation     (points,)       mγ̇³      ζ: energy lost in contacts, half of each loss at either
+                                             grain; negative where a contact gains energy because
+                                             its neighbours compress it
     ==============  ==============  =======  =======================================================
     """
 

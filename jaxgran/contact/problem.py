@@ -76,8 +76,7 @@ class DelassusProblem:
     field     shape                 unit  meaning
     ========  ====================  ====  ==========================================================
     matrix    (contacts, contacts)  1/m   W = H M⁻¹ Hᵀ, symmetric, without negative eigenvalues; a
-                                          dense array, a
-                                          matrix of ``scipy.sparse`` or a ``BCOO`` of
+                                          dense array, a matrix of ``scipy.sparse`` or a ``BCOO`` of
                                           ``jax.experimental.sparse``
     approach  (contacts,)           σγ̇    relative normal velocity u⁻ before, negative if
                                           approaching

@@ -11,9 +11,8 @@ configuration/step             (1,)            –       time steps since the fi
 configuration/box              (6,)            σ, –    L, L, 0, tilt, 0, 0; two dimensions
 particles/position             (grains, 3)     σ       centres, in the box around the origin; z = 0
 particles/velocity             (grains, 3)     σγ̇      peculiar velocities c, before the contacts
-                                                       act; in the
-                                                       laboratory c + γ̇ y x̂, up to the velocity of
-                                                       the origin
+                                                       act; in the laboratory c + γ̇ y x̂, up to the
+                                                       velocity of the origin
 particles/diameter, /mass      (grains,)       σ, m    diameters and masses
 bonds/group                    (bonds, 2)      –       pairs i < j of grains in loaded contact in
                                                        the steps that follow,

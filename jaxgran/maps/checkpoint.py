@@ -7,8 +7,7 @@ file                content
 ``map.nc``          the finished replicas, all parameters of the map, and the versions that its
                     results depend on
 ``journal-*.nc``    a batch that is running, see ``journal``; the end of its name is a hash of the
-                    parameters, versions
-                    and sources
+                    parameters, versions and sources
 ``lock``            locked by the process that writes here; released when that process ends for any
                     reason
 ==================  ================================================================================

@@ -5,8 +5,7 @@ variables.
 attribute              of                                   meaning
 =====================  ===================================  ========================================
 units                  all numbers but flags                "1": all are in units of m, σ and t, so
-                                                            they have no
-                                                            dimension
+                                                            they have no dimension
 reduced_unit           numbers that are not pure numbers    this unit, such as "m sigma / t^2"
 ancillary_variables    values with errors                   names of their errors and of their
                                                             status, "/status" where

@@ -72,8 +72,7 @@ def map_dataset(
     root                          dimensions            meaning
     ============================  ====================  ============================================
     NAME, NAME_stderr             point                 average over all seeds and its standard
-                                                        error, for each
-                                                        observable of the root
+                                                        error, for each observable of the root
     NAME_ci95                     (point,               half-width of its 95 % interval for a large
                                                         system, for the
                                   error_source)         names in ``BUDGET``

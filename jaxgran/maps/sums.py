@@ -29,9 +29,8 @@ def sum_variables(
     variable  dimensions                      meaning
     ========  ==============================  ======================================================
     tally     (point, seed, block, quantity)  the numbers of the ``Tally`` of each block of a
-                                              sample, in the order of
-                                              its fields, and behind them the sums of the user's
-                                              observables
+                                              sample, in the order of its fields, and behind them
+                                              the sums of the user's observables
     area      (point, seed)                   area of the cell
     ========  ==============================  ======================================================
     """

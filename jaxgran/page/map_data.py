@@ -48,8 +48,7 @@ def map_data(data: MapData) -> dict[str, Any]:
     key            content
     =============  =================================================================================
     axes           the dimensions, outermost first: name, label and values; numbers of grains and
-                   time
-                   steps have one value if the map has one, and none if it is not known
+                   time steps have one value if the map has one, and none if it is not known
     observables    name, meaning and unit; values; and where the map has them standard errors, whole
                    errors, predictions of kinetic theory and numbers of effective samples
     status         the status of each point; meanings of the statuses

@@ -55,8 +55,7 @@ def save_figures(
     =======================  ==========================  ===========================================
     `{stem}_curves.png`      `ratio_curves`              always
     `{stem}_contours.png`    `ratio_contours`            at least two restitutions, two packing
-                                                         fractions, and one time
-                                                         step for all points
+                                                         fractions, and one time step for all points
     `{stem}_timestep.png`    `ratio_against_timestep`    at least two time steps
     `{stem}_size.png`        `averages_against_grains`   at least two numbers of grains
     `{stem}_theory.png`      `theory_errors`             a plane as for the contours, and the

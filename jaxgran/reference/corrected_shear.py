@@ -33,19 +33,16 @@ class CorrelationLaws:
     field                    shape  meaning; all are dimensionless
     =======================  =====  ================================================================
     length                   (3,)   a, b, k of L = 1 + a (1 − α)² y + b (1 − α) y^k, y = 1/(1 −
-                                    ν/ν_J), in mean
-                                    diameters
+                                    ν/ν_J), in mean diameters
     length_stderr            (3,)   their standard errors
     pairs                    (3,)   c, e, m of R = (1 + c (1 − α)⁵) (1 + e (1 − α)^(1/3) y^m), pairs
-                                    at contact
-                                    that carry the stress over those of equilibrium
+                                    at contact that carry the stress over those of equilibrium
     pairs_stderr             (3,)   their standard errors
     jamming_fraction         ()     ν_J
     scatter                  (3,)   rms of the errors of ln T, ln p and ln τ at flows that were not
                                     fitted
     restitution_range        (2,)   smallest and largest α at which the scatter holds; nearly
-                                    elastic dense flow is more
-                                    viscous than in Enskog's theory
+                                    elastic dense flow is more viscous than in Enskog's theory
     packing_fraction_range   (2,)   smallest and largest ν at which the scatter holds
     fitted_to, judged_on            maps, in words; static
     =======================  =====  ================================================================
@@ -93,8 +90,7 @@ class CorrectedShear:
     pressure              m/t²     half the trace of the stress, kinetic and collisional
     shear_stress          m/t²     positive, kinetic and collisional
     dissipation_rate      m/t³     energy lost per unit area and time, Enskog's times R/L; equals
-                                   shear_stress ×
-                                   shear_rate
+                                   shear_stress × shear_rate
     …_stderr              as …     the first three times the scatter of the laws: standard errors of
                                    a prediction
     correlation_length    σ        L

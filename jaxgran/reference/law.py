@@ -14,6 +14,7 @@ from jax.tree_util import register_static
 import jaxgran
 from jaxgran.files import atomic_write
 from jaxgran.model.checks import as_array, require
+from jaxgran.model.display import text_of
 from jaxgran.reference.evaluation import PLANE, estimates, module_of, over_range
 from jaxgran.reference.table import LENGTH, MEASURED, Table, shipped_table, write_columns
 
@@ -54,8 +55,7 @@ class Rheology(NamedTuple):
     granular_temperature              m(σ/t)²    T = Σ m c²/(2N), c the peculiar velocity;
                                                  proportional to γ̇²
     local_granular_temperature        m(σ/t)²    T relative to the flow nearby, which long waves do
-                                                 not raise;
-                                                 proportional to γ̇²
+                                                 not raise; proportional to γ̇²
     dissipation_rate                  m/t³       Γ, energy lost per area and time, equals τγ̇;
                                                  proportional to γ̇³
     correlation_length_from_pressure  σ          L′ = (Γ_E/p_E)/(Γ/p), p the contact pressure, E
@@ -78,6 +78,12 @@ class Rheology(NamedTuple):
     dissipation_rate_ci95: Any
     correlation_length_from_pressure_ci95: Any
 
+    def __repr__(self) -> str:
+        """The averages, with ± half-widths of 95 % intervals."""
+        values = self._asdict()
+        averages = {name: x for name, x in values.items() if not name.endswith("_ci95")}
+        return text_of("Rheology", averages, {name: values[f"{name}_ci95"] for name in averages})
+
 
 @register_static
 @dataclass(frozen=True)
@@ -95,6 +101,14 @@ class ConstitutiveLaw:
     """
 
     table: Table
+
+    def __repr__(self) -> str:
+        ranges = {
+            "restitution": self.restitution_range,
+            "packing_fraction": self.packing_fraction_range,
+        }
+        texts = (f"{name}={low:.3g} to {high:.3g}" for name, (low, high) in ranges.items())
+        return f"ConstitutiveLaw({', '.join(texts)})"
 
     @property
     def restitution_range(self) -> tuple[float, float]:

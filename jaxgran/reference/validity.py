@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.model.display import with_error
+from jaxgran.model.display import text_of, with_error
 from jaxgran.reference.evaluation import estimates, over_range
 from jaxgran.reference.table import (
     CORRECTED,
@@ -55,17 +55,14 @@ class Validity(NamedTuple):
     theory         pressure, shear_stress, granular_temperature and dissipation_rate of kinetic
                    theory, same units
     error          theory over measured, less one, of all but the granular temperature and the force
-                   ratio; the theory's
-                   temperature is compared with the local one
+                   ratio; the theory's temperature is compared with the local one
     error_ci95     of each
     corrected      the same predictions by ``corrected_shear``, with measured laws of correlations
                    and pairs
-    corrected_error, corrected_error_ci95
-                   as error and error_ci95
+    corrected_error, corrected_error_ci95 as error and error_ci95
     factors        the assumptions of Enskog's contact pressure at the measured granular
-                   temperature, by name: factors
-                   whose product is the measured contact pressure over Enskog's
-                   (``sampling.enskog_factors``)
+                   temperature, by name: factors whose product is the measured contact pressure over
+                   Enskog's (``sampling.enskog_factors``)
     factors_ci95   of each, from sampling and interpolation at the number of grains of the map
     =============  =================================================================================
     """
@@ -82,6 +79,11 @@ class Validity(NamedTuple):
     corrected_error_ci95: dict[str, Any]
     factors: dict[str, Any]
     factors_ci95: dict[str, Any]
+
+    def __repr__(self) -> str:
+        """Where it is, and the measured averages with ± half-widths of 95 % intervals."""
+        where = {"restitution": self.restitution, "packing_fraction": self.packing_fraction}
+        return text_of("Validity", where | self.measured, self.measured_ci95)
 
     def fails_first(self) -> Any:
         """The name of the factor that is furthest from one, in logarithm; "none" where all are

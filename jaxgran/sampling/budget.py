@@ -11,11 +11,9 @@ part       law, and what it was measured with
 time step  ``stress_error``: the share of its free path that a grain moves in one step (``benchmarks
            stability``)
 tolerance  34 times the relative residual of a contact solve, for the part of the stress that
-           contacts carry
-           (``benchmarks solvers``)
+           contacts carry (``benchmarks solvers``)
 size       ``size_error``: long waves of velocity are missing in small systems, and the packing
-           fraction at which
-           they jam scatters (``benchmarks size_limits``)
+           fraction at which they jam scatters (``benchmarks size_limits``)
 =========  =========================================================================================
 
 A force ratio belongs to its time step, so the time step adds no error to it.

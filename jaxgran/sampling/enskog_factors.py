@@ -15,13 +15,11 @@ local_temperature  the local granular temperature: E(T_l I)/E(T I), with E the r
                    granular temperature, T_l the local one and I the identity
 anisotropy         the temperature tensor, scaled to T_l: E(T)/E(T_l I)
 chaos              the speed of approach: (V/V(T))² of a stress and (V/V(T))³ of the dissipation
-                   rate, with V the mean
-                   of the speed over collisions weighted by the stress that they carry (by the
-                   pressure, for the
-                   dissipation rate), and V(T) the same of independent grains
+                   rate, with V the mean of the speed over collisions weighted by the stress that
+                   they carry (by the pressure, for the dissipation rate), and V(T) the same of
+                   independent grains
 pairs              the pairs at contact: B/E(T) over the factor chaos, with B the rate of the same
-                   approaches as
-                   binary collisions
+                   approaches as binary collisions
 binary             the impulses: C/B, with C the measured rate
 =================  =================================================================================
 

@@ -29,8 +29,7 @@ class SteadyShear:
     collision_rate        –        collisions per grain and unit strain; each grain counts all its
                                    collisions
     dissipation_rate      m/t³     energy lost per unit area and time; equals the power of the
-                                   shear,
-                                   shear_stress × shear_rate
+                                   shear, shear_stress × shear_rate
     ====================  =======  =================================================================
 
     All are scalars, with a leading ``(replicas,)`` under ``vmap``. The unit of time t is that of
