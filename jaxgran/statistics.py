@@ -63,13 +63,13 @@ def standard_errors(
         R_ij = (1 - w) exp(-|i - j| / t) + w δ_ij
 
     within a seed and none between seeds: a first-order autoregressive process plus white noise. The
-      correlation time t, in blocks, and the share w of white noise are unknown. For given (t, w),
-      with flat priors for the mean and for ln σ, the mean has a Student's t distribution with M - 1
-      degrees of freedom for M blocks in all. Its centre is the generalised least-squares mean μ =
-      1'R⁻¹x / 1'R⁻¹1, its scale S / √((M - 1) 1'R⁻¹1) with S² = (x - μ)'R⁻¹(x - μ), and its weight
-      |R|^(-1/2) (1'R⁻¹1)^(-1/2) S^(1 - M). The interval is that of the mixture over 12 correlation
-      times from 0.2 to 20 blocks and three values of w, around the plain mean. The prior is t^(1/4)
-      / (1 + (t/2.5)²) in ln t and flat in w.
+    correlation time t, in blocks, and the share w of white noise are unknown. For given (t, w),
+    with flat priors for the mean and for ln σ, the mean has a Student's t distribution with M - 1
+    degrees of freedom for M blocks in all. Its centre is the generalised least-squares mean μ =
+    1'R⁻¹x / 1'R⁻¹1, its scale S / √((M - 1) 1'R⁻¹1) with S² = (x - μ)'R⁻¹(x - μ), and its weight
+    |R|^(-1/2) (1'R⁻¹1)^(-1/2) S^(1 - M). The interval is that of the mixture over 12 correlation
+    times from 0.2 to 20 blocks and three values of w, around the plain mean. The prior is t^(1/4) /
+    (1 + (t/2.5)²) in ln t and flat in w.
 
     Blocks of shorter seeds are merged until they last about as long as those of the longest, so
     that one correlation time holds for all, see ``merged_blocks``.
@@ -206,9 +206,9 @@ def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, fl
     """Mean of the second half of a series minus that of the first half, and its standard error.
 
     The error includes the correlation of neighbouring values: the variance of a mean is multiplied
-      by (1 + ρ)/(1 − ρ), with ρ the lag-one autocorrelation of the halves about their own means. A
-      short series underestimates ρ, so it is clipped to the range from ``least_correlation`` to
-      0.9. The series needs four values.
+    by (1 + ρ)/(1 − ρ), with ρ the lag-one autocorrelation of the halves about their own means. A
+    short series underestimates ρ, so it is clipped to the range from ``least_correlation`` to 0.9.
+    The series needs four values.
     """
     half = len(series) // 2
     halves = np.stack([series[:half], series[-half:]])

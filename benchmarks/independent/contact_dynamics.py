@@ -214,11 +214,11 @@ def _gauss_seidel(first, second, rows, impulse, kick_x, kick_y, start, stop, tar
     """Impulses of one cluster by projected Gauss-Seidel: 0 <= p, w = W p + u >= 0, p w = 0.
 
     A row holds, per contact: the normal times the reduced mass, the normal over either mass, the
-      normal velocity times the reduced mass, and one over the reduced mass. Without relaxation the
-      update of a contact over its reduced mass is its residual min(diag(W) p, w), so a sweep
-      estimates the norm for nothing; the residual of a single state decides. ``target`` is the
-      square of the norm to reach. Indices are unsigned, which spares the test for negative ones.
-      Returns the sweeps done, negative at the cap.
+    normal velocity times the reduced mass, and one over the reduced mass. Without relaxation the
+    update of a contact over its reduced mass is its residual min(diag(W) p, w), so a sweep
+    estimates the norm for nothing; the residual of a single state decides. ``target`` is the square
+    of the norm to reach. Indices are unsigned, which spares the test for negative ones. Returns the
+    sweeps done, negative at the cap.
     """
     relax = RELAX_LARGE if stop - start > SMALL else RELAX_SMALL
     for sweep in range(MAX_SWEEPS):
@@ -317,8 +317,8 @@ def _run(
     t.
 
     ``room`` bounds the outer pairs: when there are more, the loop stops early. (To grow the arrays
-      in here would make numba count their references in every step.) Returns the tilt, the steps
-      done and the pairs found, -1 if the time step is too long for the cell.
+    in here would make numba count their references in every step.) Returns the tilt, the steps done
+    and the pairs found, -1 if the time step is too long for the cell.
     """
     grains = x.size
     largest = 2.0 * radii.max()

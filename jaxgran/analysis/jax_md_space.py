@@ -40,8 +40,8 @@ def jax_md_space(state: State) -> JaxMdSpace:
     jax-md's ``periodic_general`` gets wrong.
 
     Neighbour lists in these coordinates compare all pairs: give ``disable_cell_list=True``. An
-      update does not see a shear of the box, so allocate the list anew, or update it with a
-      ``dr_threshold`` of zero.
+    update does not see a shear of the box, so allocate the list anew, or update it with a
+    ``dr_threshold`` of zero.
 
     Args:
       state: gives side and tilt; it may be traced, but is one replica.

@@ -42,8 +42,8 @@ def cell_list_pairs(
     """All pairs of grains whose centres are within a cutoff, each once.
 
     The grid is static: it serves a cutoff within which a homogeneous flow has up to 1.2 ×
-      ``capacity`` pairs, and any smaller one. Up to 2 × ``capacity`` pairs are found, with up to
-      128 grains in a cell; beyond that ``missed`` is set.
+    ``capacity`` pairs, and any smaller one. Up to 2 × ``capacity`` pairs are found, with up to 128
+    grains in a cell; beyond that ``missed`` is set.
 
     Args:
       positions: (grains, 2), centres in σ.

@@ -195,7 +195,7 @@ class BarzilaiBorwein(ProjectedMethod):
     ``ProjectedMethod``.
 
     Source: J. Barzilai and J. M. Borwein, IMA J. Numer. Anal. 8, 141 (1988); projected by E. G.
-      Birgin, J. M. Martínez and M. Raydan, SIAM J. Optim. 10, 1196 (2000).
+    Birgin, J. M. Martínez and M. Raydan, SIAM J. Optim. 10, 1196 (2000).
 
     Examples:
       >>> BarzilaiBorwein(tolerance=1e-6)
@@ -244,7 +244,7 @@ class Nesterov(ProjectedMethod):
     """Nesterov's accelerated method with restarts; fields as ``ProjectedMethod``.
 
     Source: Y. Nesterov, Sov. Math. Dokl. 27, 372 (1983); the restart: B. O'Donoghue and E. Candès,
-      Found. Comput. Math. 15, 715 (2015).
+    Found. Comput. Math. 15, 715 (2015).
 
     Examples:
       >>> Nesterov()

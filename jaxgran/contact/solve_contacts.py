@@ -118,8 +118,8 @@ def solve_contacts(
     velocities are, and one solution is returned.
 
     With one α for all contacts no solution gains energy: it changes by −½ (1 − α²) p₀ᵀ W p₀, where
-      p₀ is the solution at α = 0. A tolerance below the rounding of the velocities is met at 10
-      roundings of the largest |u⁻|.
+    p₀ is the solution at α = 0. A tolerance below the rounding of the velocities is met at 10
+    roundings of the largest |u⁻|.
 
     Raises:
       InputError: (a ValueError) a number is outside its range; a problem is empty, its shapes do
@@ -160,7 +160,7 @@ def contact_residuals(
     ===========  ===============================  ====  ===========================
 
     Sources: Fischer, Optimization 24, 269 (1992); Facchinei and Pang, Finite-Dimensional
-      Variational Inequalities (2003), chapter 1, for the natural map.
+    Variational Inequalities (2003), chapter 1, for the natural map.
 
     Raises:
       InputError: (a ValueError) as ``solve_contacts``, or the impulses are not one number for each

@@ -91,7 +91,7 @@ def contacts_now(flow: ShearFlow, state: State) -> tuple[Contacts, Int[Array, ""
     packing.
 
     The status is ``capacity`` where contacts may be missing: a step looks further ahead than the
-      list of pairs, or has more contacts than discs that hardly overlap.
+    list of pairs, or has more contacts than discs that hardly overlap.
     """
     grains, velocities = state.grains, state.velocities
     pairs = outer_pairs(state.positions, grains, state.side, state.tilt)

@@ -33,8 +33,8 @@ def merge_maps(
     """One map of the replicas of several maps: of parts, of other seeds, or of both.
 
     The result is that of one run, bit for bit: averages, standard errors and all else are computed
-      from the sums of all replicas, so the scatter between seeds of different maps is in the
-      errors. Points that no map has are NaN with the status ``not_run``.
+    from the sums of all replicas, so the scatter between seeds of different maps is in the errors.
+    Points that no map has are NaN with the status ``not_run``.
 
     Args:
       maps: data of maps, as ``ratio_map`` returns them, or their files. They have the same settings

@@ -56,9 +56,9 @@ def grain_data(
     """One instant for a page; the arguments are those of an ``Instant``, and a scale.
 
     ``data`` has, one after the other and in base64: x and y of the grains in parts of 65536 of the
-      cell, with the tilt taken off x; both grains of each pair (16 bits each); radii, speeds and
-      forces in parts of 255 of the largest radius and of the scale; and whether a pair is in a
-      cluster (8 bits each).
+    cell, with the tilt taken off x; both grains of each pair (16 bits each); radii, speeds and
+    forces in parts of 255 of the largest radius and of the scale; and whether a pair is in a
+    cluster (8 bits each).
     """
     largest = float(radii.max())
     x, y = positions.T / side

@@ -251,8 +251,8 @@ def cluster_shares(data: MapData) -> Figure:
     the excess.
 
     Left: shares of pressure and shear stress against the excess of the force ratio, with a curve
-      per restitution and a symbol per packing fraction. Right, if the map is a plane: contours of
-      the share of the pressure, and in green those of the excess.
+    per restitution and a symbol per packing fraction. Right, if the map is a plane: contours of the
+    share of the pressure, and in green those of the excess.
 
     Args:
       data: a map with `stresses/cluster_pressure_share`, `stresses/cluster_shear_share` and

@@ -144,8 +144,8 @@ def corrected_shear(
     Γ. No coefficient is adjusted to T, p or τ.
 
     Source: a correlation length that divides the dissipation rate is that of extended kinetic
-      theory, for instance of D. Vescovi, D. Berzi, P. Richard and N. Brodu, Phys. Fluids 26, 053305
-      (2014). Both laws are fits of this project (``python -m benchmarks dissipation``).
+    theory, for instance of D. Vescovi, D. Berzi, P. Richard and N. Brodu, Phys. Fluids 26, 053305
+    (2014). Both laws are fits of this project (``python -m benchmarks dissipation``).
 
     Examples:
       Grains lose less energy than in Enskog's theory, so the flow is hotter.

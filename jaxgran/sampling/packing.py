@@ -170,7 +170,7 @@ def _fire_step(now: _Fire, grains: Grains, side: Array, allowed: Array) -> _Fire
     velocities.
 
     If the overlap is already allowed, nothing moves: the returned packing is the one whose overlap
-      was computed.
+    was computed.
     """
     neighbours = now.neighbours
     used_skin = consumed_skin(neighbours.frame, neighbours.near_frame, 2 * jnp.max(grains.radii))

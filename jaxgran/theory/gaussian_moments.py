@@ -46,12 +46,12 @@ def gaussian_moments(
     ================  ====  =======================================================
 
     In each class the second moments balance: −γ̇(δ_ax T_yb + δ_bx T_ay) + Q_ab = 0, with Q Enskog's
-      collision integral including the shear across the contact. It is solved by Newton's method and
-      differentiated implicitly.
+    collision integral including the shear across the contact. It is solved by Newton's method and
+    differentiated implicitly.
 
     Source: J. T. Jenkins and M. W. Richman, J. Fluid Mech. 192, 313 (1988); J. F. Lutsko, Phys.
-      Rev. E 70, 061101 (2004). Contact values of the mixture: J. T. Jenkins and F. Mancini, J.
-      Appl. Mech. 54, 27 (1987).
+    Rev. E 70, 061101 (2004). Contact values of the mixture: J. T. Jenkins and F. Mancini, J. Appl.
+    Mech. 54, 27 (1987).
     """
     alpha, nu, rate, width = as_floats(restitution, packing_fraction, shear_rate, polydispersity)
     return steady_moments(

@@ -36,7 +36,7 @@ def garzo_dufty(
     dilute flow this expansion then gives a temperature several times too high.
 
     Source: V. Garzó and J. W. Dufty, Phys. Rev. E 59, 5895 (1999); in two dimensions J. F. Lutsko,
-      Phys. Rev. E 72, 021306 (2005).
+    Phys. Rev. E 72, 021306 (2005).
 
     Examples:
       Bagnold scaling: 1/γ̇ is the only time scale, so stresses scale as γ̇².

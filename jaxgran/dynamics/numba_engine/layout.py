@@ -20,7 +20,7 @@ class Inputs(NamedTuple):
     """Numbers of an advance, passed as one row of doubles in this order.
 
     resume_at: where an earlier call was suspended, ``BETWEEN_LISTS`` or ``WITHIN_LIST``; 0 to
-      begin.
+    begin.
     """
 
     side: Any
