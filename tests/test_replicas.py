@@ -119,6 +119,7 @@ MISTAKES = {
         "one axis of replicas",
     ),
     "strains of another number": (lambda s: sample(FLOWS, s, np.ones(2)), "one axis of replicas"),
+    "no flow at all": (lambda s: sample(FLOWS[:0], s[:0], 0.1), "at least one replica"),
     "two axes": (
         lambda s: sample(jax.tree.map(lambda x: x[None], FLOWS), s, 0.1),
         "one axis of replicas",

@@ -21,7 +21,7 @@ from jaxgran.model.checks import InputError, as_array, concrete_or_none, require
 
 LARGEST_FACTORED = 2048  # contacts of a matrix whose eigenvalues are checked, which takes 0.1 s
 _UNIT_LENGTH = 1e-5  # error of the length of a normal; float32 and typed digits pass
-_BATCH = "a batch of problems is solved by jax.vmap(jaxgran.solve_contacts)"
+_BATCH = "jax.vmap applies to a batch of problems, as jax.vmap(jaxgran.solve_contacts)"
 
 
 @jax.tree_util.register_dataclass

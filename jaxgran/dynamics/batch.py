@@ -6,8 +6,8 @@ batch, to the bit.
 ==========================  ========================================================================
 where                       how the replicas of a batch advance
 ==========================  ========================================================================
-a processor                 the compiled function of one replica is called for each, in threads on
-                            several cores (``run_batch``)
+a processor                 ``sample`` and ``prepare`` call the compiled function of one replica for
+                            each, in threads on several cores (``run_batch``)
 an accelerator              in lockstep, in one compiled function of the batch
 several devices             each device advances its share; devices of all hosts that
                             ``jax.distributed`` connects wait for each other at the end of a call
@@ -84,6 +84,8 @@ def _batch_of(flow: Any, state: Any, *numbers: Any) -> Arguments | None:
     if not shapes:
         return None
     shapes |= {np.shape(x) for x in numbers} - {()}
+    if (0,) in shapes:
+        raise InputError("a batch must have at least one replica.")
     if len(shapes) > 1 or len(max(shapes)) > 1:
         raise InputError(
             "a batch must have one axis of replicas, the same in the flow, the state and all "
@@ -171,7 +173,7 @@ def run_batch(
 
     Args:
       function: called as ``function(*replica, *shared, *static)``; compiled for one replica. So
-        batches of any size need no further compilation on a processor.
+        batches of any size need no further compilation where JAX has one processor.
       batch: arguments with a leading (replicas,) axis.
       shared, static: arguments that all replicas have in common; the latter are not traced.
       costs: relative cost of each replica. Threads begin with the most expensive ones.
@@ -253,9 +255,9 @@ def in_threads(
     """Run a function on the arguments of every task, started in order in threads of this process,
     and yield each result when it is there. Compiled programs run without the interpreter's lock.
 
-    When the generator ends early, each thread ends at its next message. Ctrl-C also stops the numba
-    engine, within one step. A thread that takes longer, as for a compilation, is left behind;
-    Python ends after it.
+    When the generator ends early, each thread ends at its next message or task. Ctrl-C also stops
+    the numba engine, within one step. A thread that takes longer, as for a compilation, is left
+    behind; Python ends after it.
 
     Args:
       function: called with the arguments of a task and ``send``. A long task calls ``send`` after
@@ -284,6 +286,8 @@ def in_threads(
     def work() -> None:
         with jax.enable_x64(x64), jax.default_device(device):  # each thread has its own
             for number, arguments in waiting:
+                if cancelled.is_set():
+                    return
                 try:
                     events.put((_RESULT, (number, function(*arguments, send))))
                 except BaseException as error:
@@ -291,10 +295,10 @@ def in_threads(
                     return
 
     running = [Thread(target=work, name=f"jaxgran-{k}") for k in range(min(threads, len(tasks)))]
-    for thread in running:
-        thread.start()
     unfinished = len(tasks)
     try:
+        for thread in running:
+            thread.start()
         while unfinished:
             kind, content = events.get()
             if kind == _ERROR:
@@ -318,4 +322,5 @@ def _join(threads: Iterable[Thread]) -> None:
     """Wait for the end of the threads, but not for long."""
     end = time.monotonic() + PATIENCE
     for thread in threads:
-        thread.join(max(0.0, end - time.monotonic()))
+        if thread.is_alive():  # one that was never started cannot be joined
+            thread.join(max(0.0, end - time.monotonic()))

@@ -35,7 +35,7 @@ _SINGLE_PRECISION = (
 class Jax:
     """The engine in JAX: every backend, precision and solver, and derivatives.
 
-    The replicas of a batch advance one after another on a processor, and in lockstep on an
+    The replicas of a batch advance each by itself on a processor, and in lockstep on an
     accelerator.
 
     Examples:
@@ -171,7 +171,7 @@ def in_lockstep() -> bool:
     """Whether the replicas of a batch advance together, as one array program that waits for its
     slowest replica.
 
-    They do on an accelerator. On a processor they advance one after another, which is faster.
+    They do on an accelerator. On a processor each advances by itself, which is faster.
     """
     return default_device().platform != "cpu"
 

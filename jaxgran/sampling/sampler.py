@@ -246,6 +246,6 @@ def check_precision(flow: ShearFlow, state: State) -> None:
     if float(np.min(np.asarray(flow.timestep) * np.asarray(flow.shear_rate))) < least:
         raise InputError(
             f"timestep must be at least {two_digits(least, up=True)} / shear_rate for positions in "
-            f"{state.positions.dtype}: "
-            'use a longer one, or float64 (jax.config.update("jax_enable_x64", True)).'
+            f"{state.positions.dtype}: use a longer one, or float64 "
+            '(jax.config.update("jax_enable_x64", True)).'
         )

@@ -146,8 +146,8 @@ class Pairs(NamedTuple):
     images: (2, slots).
     calendar: (3, slots), steps.
     bounds: (2, blocks), the least strike and begin of a block of the calendar, or less.
-    of_grain: (2 capacity,), pairs of the grains, those of grain g at ``offsets[g] : offsets[g +
-      1]``.
+    of_grain: (2 capacity,), pairs of the grains, those of grain g at
+      ``offsets[g] : offsets[g + 1]``.
     starts, cells, sorted: for the search, (cells + 1,), the cell of each grain, and the grains in
       the order of the cells.
     places: (3, grains), x, y and radius of these.
@@ -193,8 +193,8 @@ class Network(NamedTuple):
 class Clusters(NamedTuple):
     """Contacts that touch each other, sorted by cluster, and the memory of their solver.
 
-    source: (contacts,), indices in the network; those of cluster m at ``starts[m] : starts[m +
-      1]``.
+    source: (contacts,), indices in the network; those of cluster m at
+      ``starts[m] : starts[m + 1]``.
     of_grain: (2 contacts,), contacts of the grains, those of grain g from ``offsets[g]`` on.
     queue, reached: (grains,), for the search for clusters.
 
