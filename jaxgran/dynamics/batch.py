@@ -132,11 +132,17 @@ def over_replicas(
     On an accelerator they advance in lockstep, by ``vmap`` with a named axis.
     """
     flow, state, *_ = batch
-    if in_lockstep():
-        return jax.vmap(function, axis_name=AXIS)(*batch)
-    if isinstance(select_engine(flow, numerics, state, option), Jax):
-        return lax.map(lambda replica: function(*replica), batch)
+    lockstep = in_lockstep()
+    if lockstep or isinstance(select_engine(flow, numerics, state, option), Jax):
+        return _by_jax(function, lockstep, batch)
     return jax.vmap(function)(*batch)
+
+
+def _by_jax(function: Callable[..., Any], lockstep: bool, batch: Arguments) -> Any:
+    """The function of one replica for a batch, in lockstep or in turn."""
+    if lockstep:
+        return jax.vmap(function, axis_name=AXIS)(*batch)
+    return lax.map(lambda replica: function(*replica), batch)
 
 
 def shear_batch(
@@ -207,9 +213,7 @@ def _together(
         def run(*replica: Any) -> Any:
             return function(*replica, *shared, *static)
 
-        if lockstep:
-            return jax.vmap(run, axis_name=AXIS)(*batch)
-        return lax.map(lambda replica: run(*replica), batch)
+        return _by_jax(run, lockstep, batch)
 
     def gathered(shared: tuple, batch: Arguments) -> Any:
         results = share(shared, batch)

@@ -83,20 +83,6 @@ def advance_batch(
     return run(_observe_replica, shared=(numerics,), static=(observe,))
 
 
-def _advance(
-    flow: ShearFlow,
-    state: State,
-    steps: Array,
-    numerics: Numerics,
-    observe: Observable | None = None,
-) -> tuple[State, Tally]:
-    return advance_and_observe(flow, numerics, state, steps, observe)
-
-
-_advance_replica = persistent_jit(_advance, register_numba)
-_observe_replica = jax.jit(_advance, static_argnames="observe")
-
-
 def reporting(advance: ObserveBatch, report: Report) -> ObserveBatch:
     """The same advance with a report after each call."""
 
@@ -115,7 +101,11 @@ def reporting(advance: ObserveBatch, report: Report) -> ObserveBatch:
 
 
 def advance_and_observe(
-    flow: ShearFlow, numerics: Numerics, state: State, steps: Array, observe: Observable | None
+    flow: ShearFlow,
+    state: State,
+    steps: Array,
+    numerics: Numerics,
+    observe: Observable | None = None,
 ) -> tuple[State, Tally]:
     """``advance``, with the sums of what a function observes in ``Tally.observed``."""
     if observe is None:
@@ -124,6 +114,10 @@ def advance_and_observe(
         flow, numerics, state, steps, partial(_observe_step, observe)
     )
     return end, replace(tally, observed=sums)
+
+
+_advance_replica = persistent_jit(advance_and_observe, register_numba)
+_observe_replica = jax.jit(advance_and_observe, static_argnames="observe")
 
 
 def observed_shapes(observe: Observable, flow: ShearFlow) -> Any:

@@ -172,7 +172,7 @@ def _sample_blocks(
     """The final state and the sample of blocks with the given numbers of time steps."""
 
     def block(state: State, steps: Array) -> tuple[State, Tally]:
-        return advance_and_observe(flow, numerics, state, steps, observe)
+        return advance_and_observe(flow, state, steps, numerics, observe)
 
     if observe is None:
         state, tally = advance_blocks(flow, numerics, state, steps)
