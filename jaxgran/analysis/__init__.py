@@ -1,4 +1,4 @@
-"""Analysis of snapshots: force chains, order, velocity statistics, coarse-grained fields.
+"""Analysis of snapshots: force chains, coarse-grained fields, fits, and a space of jax-md.
 
 It imports `dynamics` and the folders below it, but neither `sampling` nor `io`. Begin with
 `series`.
