@@ -12,6 +12,7 @@ at dt = 1e-3 what becomes of the force ratio.
     python -m benchmarks reference_map --seeds 4     # two seeds more
     python -m benchmarks reference_map --part sizes  # flows of several sizes
     python -m benchmarks reference_map --part large  # one flow of 102,400 grains, half an hour
+    python -m benchmarks reference_map --part check  # flows that no law was fitted to, 20 minutes
     python -m benchmarks reference_map --part coarse  # dt = 1e-3
     python -m benchmarks reference_map --quick       # 3 × 3 points of 64 and 100 grains, a minute
 """
@@ -72,6 +73,18 @@ def large(quick: bool) -> dict[str, dict[str, Any]]:
     return {"large": chosen | {"grains": 512 if quick else 102_400}}
 
 
+def check(quick: bool) -> dict[str, dict[str, Any]]:
+    """The arguments of ``ratio_map`` for flows that no law of the size was fitted to, small and
+    large.
+    """
+    alphas, nus = (0.15, 0.35, 0.6, 0.85), (0.3, 0.5, 0.65, 0.76)
+    chosen = {"restitution": alphas, "packing_fraction": nus, "timestep": 5e-4}
+    return {
+        "check_small": chosen | {"grains": (64, 100) if quick else (256, 1024), "seeds": 8},
+        "check_large": chosen | {"grains": 200 if quick else 25_600, "seeds": 1},
+    }
+
+
 def coarse(quick: bool) -> dict[str, dict[str, Any]]:
     """The arguments of ``ratio_map`` at dt = 1e-3, where grains are slow enough for it and clusters
     form.
@@ -92,6 +105,9 @@ def coarse(quick: bool) -> dict[str, dict[str, Any]]:
     }
 
 
+PARTS = {"sizes": sizes, "large": large, "check": check, "coarse": coarse}
+
+
 def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT) -> None:
     """Map what is missing of a part, and write it: all seeds as one map, ``reference.nc``."""
     folder = folder.with_name(f"{folder.name}_quick") if output.quick else folder
@@ -105,7 +121,7 @@ def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT
             "progress": True,
             "attributes": about,
         }
-        return jg.ratio_map(**chosen, **kept, seeds=1, workers=usable_cores())
+        return jg.ratio_map(**{"seeds": 1, **chosen}, **kept, workers=usable_cores())
 
     if part == "plane":
         merged = jg.merge_maps(
@@ -114,7 +130,5 @@ def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT
         merged.attrs["command"] = about["command"]
         write_dataset(merged, output.path("reference", ".nc"))
         return
-    for name, chosen in {"sizes": sizes, "large": large, "coarse": coarse}[part](
-        output.quick
-    ).items():
+    for name, chosen in PARTS[part](output.quick).items():
         write_dataset(made(name, **chosen), output.path("reference", f"_{name}.nc"))

@@ -78,14 +78,21 @@ BENCHMARKS = (
         (120, 1),
         (
             "reference.nc",
-            *(f"reference_{name}.nc" for name in ("sizes_loose", "sizes_dense", "large", "coarse")),
+            *(
+                f"reference_{name}.nc"
+                for name in (
+                    *("sizes_loose", "sizes_dense", "large"),
+                    *("check_small", "check_large", "coarse"),
+                )
+            ),
         ),
         (
             Option("--seeds", "number of seeds, those that are kept included", int),
             Option(
                 "--part",
-                "the plane, flows of several sizes, a large one, or a coarse time step",
-                choices=("plane", "sizes", "large", "coarse"),
+                "the plane, flows of several sizes, a large one, some that no law was fitted to, or "
+                "a coarse time step",
+                choices=("plane", "sizes", "large", "check", "coarse"),
             ),
             Option("--folder", "where the maps that are done are kept", Path),
         ),
