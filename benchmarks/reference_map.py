@@ -112,7 +112,7 @@ def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT
     """Map what is missing of a part, and write it: all seeds as one map, ``reference.nc``."""
     folder = folder.with_name(f"{folder.name}_quick") if output.quick else folder
     folder.mkdir(parents=True, exist_ok=True)
-    about = {"command": "python -m benchmarks reference_map", "commit": output.hardware["commit"]}
+    about = {"command": "python -m benchmarks reference_map"}
 
     def made(name: str, **chosen: Any) -> xr.DataTree:
         kept = {

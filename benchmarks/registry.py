@@ -90,8 +90,8 @@ BENCHMARKS = (
             Option("--seeds", "number of seeds, those that are kept included", int),
             Option(
                 "--part",
-                "the plane, flows of several sizes, a large one, some that no law was fitted to, or "
-                "a coarse time step",
+                "the plane, flows of several sizes, a large one, flows that no law was fitted to, "
+                "or a coarse time step",
                 choices=("plane", "sizes", "large", "check", "coarse"),
             ),
             Option("--folder", "where the maps that are done are kept", Path),
