@@ -114,7 +114,7 @@ def _say_imprecise(data) -> None:
     known = np.isfinite(errors).all(axis=0)
     if not known.any():
         return
-    strain = data["seeds/strain"].where(data["seeds/strain"] > 0)
+    strain = data["sums/strain"].where(data["sums/strain"] > 0)
     lost = f" of the {known.sum()} points with an error" if not known.all() else ""
     say(
         f"relative errors: {data.attrs['error']:g} requested, {errors[:, known].max():.2g} at the "
