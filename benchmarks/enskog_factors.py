@@ -27,9 +27,8 @@ from matplotlib.lines import Line2D
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.environment import usable_cores
-from jaxgran.maps.theory_variables import LENGTHS
 from jaxgran.plotting.drawing import SMALL_SIZE, TWO_COLUMNS, curve_styles, styled
-from jaxgran.sampling.enskog_factors import FACTORS, RATES, measured_over_enskog
+from jaxgran.sampling.enskog_factors import FACTORS, LENGTHS, RATES, measured_over_enskog
 from jaxgran.sampling.sample import estimates
 
 START = 1e-3  # time step of the steady state, and of all numbers of grains

@@ -66,7 +66,7 @@ def fresh_rows(points: int, grains: list[int], timestep: float) -> Iterator[dict
 
 def _row(data: xr.DataTree) -> dict[str, float]:
     point = flattened(data).squeeze(("restitution", "packing_fraction"))
-    row = {"status": int(point.status), "strain": round(data["seeds"].strain.item(), 1)}
+    row = {"status": int(point.status), "strain": round(data["sums"].strain.item(), 1)}
     for name in OBSERVABLES:
         row |= {name: _short(point[name]), f"{name}_stderr": _short(point[f"{name}_stderr"])}
         for source in ("timestep", "tolerance"):

@@ -119,25 +119,6 @@ def merged_blocks(lengths: np.ndarray | None, seeds: int, blocks: int) -> np.nda
     return np.maximum(1, blocks // np.maximum(1, merge)).astype(int)
 
 
-def error_correlation(
-    estimate: Callable[[Any], Mapping[str, Any]], sums: Any, lengths: np.ndarray | None = None
-) -> np.ndarray:
-    """Correlation matrix (n, n) of the errors of n scalar estimates, from the influences of the
-    blocks.
-
-    Args:
-      estimate, sums, lengths: as in ``standard_errors``.
-
-    Returns:
-      The matrix in the order of the estimates; NaN for an estimate that does not vary.
-    """
-    _, influence, _, _ = _influences(estimate, sums, lengths)
-    flat = np.concatenate(influence)
-    with np.errstate(invalid="ignore"):
-        unit = flat / np.sqrt(np.sum(flat**2, axis=0))
-    return unit.T @ unit
-
-
 def jackknife(
     estimate: Callable[[Any], Mapping[str, Any]], sums: Any
 ) -> tuple[Estimates, Estimates]:

@@ -90,7 +90,7 @@ def write_few_variables(patch: pytest.MonkeyPatch, *more: str) -> None:
     """
     whole, names = results.write_dataset, ("force_ratio", "stress_ratio", *more)
     kept = {f"{name}{end}" for name in names for end in ("", "_stderr", "_ci95")}
-    kept |= {"status", "seeds/status", "seeds/strain"}
+    kept |= {"status", "sums/status", "sums/strain"}
     patch.setattr(
         results, "write_dataset", lambda data, path: whole(with_variables(data, *kept), path)
     )

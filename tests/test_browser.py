@@ -264,7 +264,7 @@ def test_copied_are_the_table_and_a_command_that_runs(
     command = shlex.split(text)
     assert command[:2] == ["jaxgran", "map"] and "--strain" in command
     assert float(command[command.index("--strain") + 1]) == pytest.approx(
-        4 * float(page_map()["seeds/strain"].sel(here(map_page)).mean()), rel=0.01
+        4 * float(page_map()["sums/strain"].sel(here(map_page)).mean()), rel=0.01
     )
     measured = Mock(side_effect=SystemExit(0))
     monkeypatch.setattr("jaxgran.maps.ratio_map.ratio_map", measured)

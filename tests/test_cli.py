@@ -39,10 +39,10 @@ from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
 from jaxgran.io.trajectory import read_trajectory
 from jaxgran.maps import ratio_map as ratio_map_module
-from jaxgran.maps.dataset import NOT_RUN
 from jaxgran.maps.presets import combined
 from jaxgran.maps.results import open_map, write_dataset
 from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
+from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
 from jaxgran.plotting.map_figures import FIGURES
@@ -167,7 +167,7 @@ def test_map_writes_a_dataset_and_its_figures(small_map, small_data) -> None:
     np.testing.assert_array_equal(data.restitution, [0.5, 0.9])
     np.testing.assert_array_equal(data.packing_fraction, [0.5, 0.6])
     assert np.all(data.force_ratio >= 0.99)
-    assert np.all(data["seeds/equilibration_strain"] == 0.5)
+    assert np.all(data["sums/equilibration_strain"] == 0.5)
     assert data.attrs["command"] == f"jaxgran {SMALL_MAP}"
     assert data.attrs["replica_steps_per_second"] > 0
 
@@ -302,7 +302,7 @@ def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:
     assert data.attrs["error"] == 0.1
     for name in ("force_ratio", "pressure", "shear_stress"):
         assert np.all(data[f"{name}_stderr"] <= sampling_error(0.1) * data[name])
-    assert data["seeds/strain"].item() >= LEAST_SAMPLE
+    assert data["sums/strain"].item() >= LEAST_SAMPLE
     assert "relative errors: 0.1 requested" in outcome.err
 
 

@@ -24,7 +24,6 @@ KINDS = ("force_ratio", "stress_ratio", "local_granular", "max_overlap", "contac
 KINDS += (
     "enskog_pressure",
     "collision_rate",
-    "friction_error",
     "status",
     "correlation",
     "force",
@@ -39,14 +38,14 @@ def made(**choices) -> xr.DataTree:
     """Return a map of random numbers with instants, by settings of one's own."""
     settings = MapSettings((0.5, 0.9), (0.5, 0.6), seeds=2, strain=2.0, snapshots=True, **choices)
     rng, points = np.random.default_rng(0), len(settings.flows())
-    found = {
+    replicas = {
         (point, seed): random_replica(rng, settings, Status.ok, point)._replace(
             state=random_state(point)
         )
         for point in range(points)
         for seed in range(2)
     }
-    return map_dataset(settings, found, {"command": "jaxgran map"})
+    return map_dataset(settings, replicas, {"command": "jaxgran map"})
 
 
 @pytest.fixture(scope="module")
@@ -103,13 +102,13 @@ def test_units_are_those_of_pure_numbers_and_links_lead_to_variables(kind: str, 
             flags = "flag_values" in variable.attrs or variable.dtype.kind == "U"
             assert variable.attrs.get("units", "1" if flags else None) == "1", name
             for linked in variable.attrs.get("ancillary_variables", "").split():
-                there = data if linked.startswith("/") else node
-                assert set(there[linked.strip("/")].dims) <= {*variable.dims, "error_source"}, name
-    for name, one in OBSERVABLES.items():
+                group = data if linked.startswith("/") else node
+                assert set(group[linked.strip("/")].dims) <= {*variable.dims, "error_source"}, name
+    for name, row in OBSERVABLES.items():
         whole = data[path_of(name)].attrs
-        assert whole.get("reduced_unit", "1") == one.unit
-        status = "status" if one.group == "/" else "/status"
-        errors = set() if one.group == "diagnostics" else {f"{name}_stderr"}
+        assert whole.get("reduced_unit", "1") == row.unit
+        status = "status" if row.group == "/" else "/status"
+        errors = set() if row.group == "diagnostics" else {f"{name}_stderr"}
         assert {status, *errors} <= set(whole["ancillary_variables"].split())
         assert whole["cell_methods"].startswith("realization: time: ")
 

@@ -15,16 +15,19 @@ from jaxgran.maps.results import is_finished, open_map, write_dataset
 from jaxgran.maps.schema import flattened, path_of
 from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.settings import MapSettings
-from jaxgran.maps.theory_variables import ENSKOG, LENGTHS, THEORY
+from jaxgran.maps.variables import VARIABLES
 from jaxgran.model.status import Status
 from jaxgran.sampling.budget import error_budget, size_error
-from jaxgran.sampling.enskog_factors import FACTORS, measured_over_enskog
+from jaxgran.sampling.enskog_factors import FACTORS, LENGTHS, measured_over_enskog
 from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.sample import BLOCKS
 from jaxgran.theory.gaussian_moments import gaussian_moments
 
 ALPHAS, NUS, SEEDS = (0.5, 0.9), (0.5, 0.6), 3
-FEW = ("force_ratio", "force_ratio_stderr", "status", "seeds/status")
+THEORY = [
+    row.path[7:] for row in VARIABLES if row.path[7:] in OBSERVABLES and row.group == "theory"
+]
+FEW = ("force_ratio", "force_ratio_stderr", "status", "sums/status")
 RUN = {"command": "jaxgran map", "wall_time_seconds": 12.0, "replica_steps_per_second": 1e5}
 
 
@@ -63,16 +66,16 @@ def test_every_observable_has_its_dimensions_and_errors(data) -> None:
         "axis_b": 2,
         "error_source": 5,
     }
-    for name, one in OBSERVABLES.items():
-        tail, path = one.axes, path_of(name)
-        assert data[path].dims == ("packing_fraction", "restitution", *tail)
-        if one.group == "diagnostics":
+    for name, row in OBSERVABLES.items():
+        path = path_of(name)
+        assert data[path].dims == ("packing_fraction", "restitution", *row.axes)
+        if row.group == "diagnostics":
             assert f"{path}_stderr" not in data["diagnostics"].data_vars
         else:
             assert data[f"{path}_stderr"].dims == data[path].dims
 
 
-@pytest.mark.parametrize("version", [None, 2])
+@pytest.mark.parametrize("version", [None, 3])
 def test_a_file_of_another_format_is_refused_in_a_sentence(
     few, version: int | None, tmp_path: Path
 ) -> None:
@@ -81,7 +84,7 @@ def test_a_file_of_another_format_is_refused_in_a_sentence(
     if version is not None:
         other.attrs["format_version"] = version
     write_dataset(other, tmp_path / "map.nc")
-    with refused("and this version of jaxgran reads format_version 3"):
+    with refused("and this version of jaxgran reads format_version 4"):
         open_map(tmp_path / "map.nc")
 
 
@@ -89,7 +92,7 @@ def test_everything_has_a_long_name_and_numbers_have_units(data) -> None:
     data = flattened(data)
     assert all(data[name].attrs["long_name"] for name in data.variables)
     without = {name for name in data.variables if "units" not in data[name].attrs}
-    assert without == {"axis_a", "axis_b", "error_source", "observable", "status", "seeds/status"}
+    assert without == {"axis_a", "axis_b", "error_source", "observable", "status", "sums/status"}
     by_hand = {
         "timestep": "1 / shear rate",
         "pressure_stderr": "m / t^2",
@@ -105,10 +108,10 @@ def test_everything_has_a_long_name_and_numbers_have_units(data) -> None:
 def test_every_average_has_the_strain_of_an_independent_sample(data) -> None:
     strains = data["diagnostics/correlation_strain"]
     assert set(strains.observable.values) == {
-        name for name, one in OBSERVABLES.items() if not (one.tensor or one.extreme)
+        name for name, row in OBSERVABLES.items() if not (row.tensor or row.extreme)
     }
     block = (
-        data["seeds/strain"].mean("seed") / BLOCKS
+        data["sums/strain"].mean("seed") / BLOCKS
     )  # made-up blocks are independent, and no less can be resolved
     lengths = (strains.sel(observable="force_ratio") / block).values[0]
     assert np.all((lengths > 0.8) & (lengths < 4))
@@ -120,23 +123,23 @@ def test_prediction_stands_beside_what_is_measured(data) -> None:
         measured = data[path_of(name)]
         assert predicted.dims == measured.dims
         assert predicted.attrs.get("reduced_unit") == measured.attrs.get("reduced_unit")
-        for there in predicted.stack(point=measured.dims).transpose("point"):
-            theory = gaussian_moments(float(there.restitution), float(there.packing_fraction))
-            assert float(there) == pytest.approx(float(getattr(theory, name)), rel=1e-9)
+        for value in predicted.stack(point=measured.dims).transpose("point"):
+            theory = gaussian_moments(float(value.restitution), float(value.packing_fraction))
+            assert float(value) == pytest.approx(float(getattr(theory, name)), rel=1e-9)
 
 
 def test_factors_and_lengths_are_those_of_the_samples_of_a_point(settings, data, results) -> None:
     samples = [results[0, seed].sample for seed in range(SEEDS)]
     value, error = measured_over_enskog(settings.flows()[0], samples)
-    here = data["theory"].sel(packing_fraction=NUS[0], restitution=ALPHAS[0])
+    point = data["theory"].sel(packing_fraction=NUS[0], restitution=ALPHAS[0])
     stored = {f"enskog_factor_pressure_{factor}": f"pressure_{factor}" for factor in FACTORS}
-    stored |= {name: name for name in (*LENGTHS, *(f"enskog_{rate}" for rate in ENSKOG))}
+    stored |= {name: name for name in (*LENGTHS, "enskog_pressure")}
     assert set(stored.values()) <= set(value)
-    for there, name in stored.items():
+    for path, name in stored.items():
         for ending in ("", "_stderr"):
-            assert data["theory"][there + ending].dims == ("packing_fraction", "restitution")
+            assert data["theory"][path + ending].dims == ("packing_fraction", "restitution")
         np.testing.assert_array_equal(
-            [here[there], here[f"{there}_stderr"]], [value[name], error[name]]
+            [point[path], point[f"{path}_stderr"]], [value[name], error[name]]
         )
 
 
@@ -149,14 +152,14 @@ def test_elastic_flow_has_no_prediction() -> None:
 
 def test_values_stand_at_their_point_and_seed(data, results) -> None:
     for (point, seed), replica in results.items():
-        there = {
+        place = {
             "packing_fraction": NUS[point // 2],
             "restitution": ALPHAS[point % 2],
             "seed": seed,
         }
-        assert data["seeds/status"].sel(there) == replica.status
-        assert data["seeds/strain"].sel(there) == pytest.approx(replica.sample.tally.duration.sum())
-        assert data["seeds/equilibration_strain"].sel(there) == replica.strain
+        assert data["sums/status"].sel(place) == replica.status
+        assert data["sums/strain"].sel(place) == pytest.approx(replica.sample.tally.duration.sum())
+        assert data["sums/equilibration_strain"].sel(place) == replica.strain
 
 
 def test_point_is_the_ratio_of_the_sums_of_its_seeds_that_were_not_given_up(data, results) -> None:
@@ -166,20 +169,20 @@ def test_point_is_the_ratio_of_the_sums_of_its_seeds_that_were_not_given_up(data
             for (p, _), r in results.items()
             if p == point and r.status != Status.infeasible
         ]
-        there = data.sel(packing_fraction=NUS[point // 2], restitution=ALPHAS[point % 2])
+        flow = data.sel(packing_fraction=NUS[point // 2], restitution=ALPHAS[point % 2])
         ratio = sum(t.impulse.sum() for t in tallies) / sum(t.binary_impulse.sum() for t in tallies)
-        assert there.force_ratio == pytest.approx(ratio)
+        assert flow.force_ratio == pytest.approx(ratio)
         moment = sum(t.contact_moment.sum(axis=0) for t in tallies)
         duration = sum(t.duration.sum() for t in tallies)
-        np.testing.assert_allclose(there["stresses"].contact_stress, moment / duration / 100.0)
-        assert there["diagnostics"].max_overlap == max(t.largest_overlap.max() for t in tallies)
+        np.testing.assert_allclose(flow["stresses"].contact_stress, moment / duration / 100.0)
+        assert flow["diagnostics"].max_overlap == max(t.largest_overlap.max() for t in tallies)
 
 
 def test_worst_status_wins_and_is_a_cf_flag(data) -> None:
     np.testing.assert_array_equal(
         data.status, [[Status.iteration_limit, Status.infeasible], [Status.ok, NOT_RUN]]
     )
-    for name in ("status", "seeds/status"):
+    for name in ("status", "sums/status"):
         values, meanings = (
             data[name].attrs["flag_values"],
             data[name].attrs["flag_meanings"].split(),
@@ -193,24 +196,24 @@ def test_worst_status_wins_and_is_a_cf_flag(data) -> None:
 
 def test_replicas_that_were_given_up_have_failed(settings, results) -> None:
     given_up = map_dataset(settings, {**results, (0, 0): None}, RUN)
-    assert given_up["seeds/status"][0, 0, 0] == given_up.status[0, 0] == Status.failed
+    assert given_up["sums/status"][0, 0, 0] == given_up.status[0, 0] == Status.failed
     assert np.isfinite(given_up.force_ratio[0, 0])
     assert not is_finished(given_up)
 
 
 def test_a_jammed_point_has_no_value(settings, results) -> None:
     jammed = {
-        key: one._replace(status=int(Status.infeasible)) if key[0] == 1 else one
-        for key, one in results.items()
+        key: replica._replace(status=int(Status.infeasible)) if key[0] == 1 else replica
+        for key, replica in results.items()
     }
-    here = map_dataset(settings, jammed, RUN).sel(packing_fraction=NUS[0], restitution=ALPHAS[1])
-    assert here.status == Status.infeasible
+    point = map_dataset(settings, jammed, RUN).sel(packing_fraction=NUS[0], restitution=ALPHAS[1])
+    assert point.status == Status.infeasible
     for name in ("force_ratio", "pressure_stderr", "pressure_ci95", "stresses/contact_stress"):
-        assert np.isnan(here[name]).all()
+        assert np.isnan(point[name]).all()
 
 
 def test_missing_replicas_are_nan_and_not_run(settings, data) -> None:
-    missing = data["seeds"].sel(packing_fraction=0.6, restitution=0.9).isel(seed=[1, 2])
+    missing = data["sums"].sel(packing_fraction=0.6, restitution=0.9).isel(seed=[1, 2])
     assert (missing.status == NOT_RUN).all()
     nothing = map_dataset(settings, {}, {})
     for name in OBSERVABLES:
@@ -313,17 +316,17 @@ def test_grains_chosen_by_point_are_in_the_file_and_change_the_error(tmp_path: P
     )
     assert [flow.grains for flow in chosen.flows()] == [64, 256, 256, 1024]
     rng = np.random.default_rng(0)
-    found = map_dataset(
+    data = map_dataset(
         chosen, {(point, 0): random_replica(rng, chosen, Status.ok) for point in range(4)}, RUN
     )
-    np.testing.assert_array_equal(found.point_grains, [[64, 256], [256, 1024]])
+    np.testing.assert_array_equal(data.point_grains, [[64, 256], [256, 1024]])
     for k, grains in enumerate((64, 256, 256, 1024)):
         alpha, nu = ALPHAS[k % 2], NUS[k // 2]
-        point = found.sel(packing_fraction=nu, restitution=alpha)
+        point = data.sel(packing_fraction=nu, restitution=alpha)
         size = float(size_error(alpha, nu, grains))
         expected = size / (1 - size)
         assert float(
             point.pressure_ci95.sel(error_source="size") / abs(point.pressure)
         ) == pytest.approx(expected)
-    write_dataset(with_variables(found, *FEW), tmp_path / "map.nc")
+    write_dataset(with_variables(data, *FEW), tmp_path / "map.nc")
     assert MapSettings(**from_attrs(open_map(tmp_path / "map.nc"))) == chosen

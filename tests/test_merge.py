@@ -95,7 +95,7 @@ def test_maps_of_other_seeds_make_the_map_of_all_seeds_with_the_scatter_between_
     merged = merge_maps([second, first])
     assert_one_run(merged, of_seeds(replicas, 0, 3))
     assert merged.attrs["wall_time_seconds"] == 4.0
-    assert merged["seeds"].sizes["seed"] == 3 and not merged.force_ratio_stderr.equals(
+    assert merged["sums"].sizes["seed"] == 3 and not merged.force_ratio_stderr.equals(
         first.force_ratio_stderr
     )
 
@@ -239,10 +239,10 @@ def test_maps_of_a_users_solver_are_merged_with_it(replicas) -> None:
 
 def test_statuses_of_a_map_are_read_by_the_names_that_it_has(replicas) -> None:
     data = of_seeds(replicas, 0, 3)
-    status = data["seeds"].status
+    status = data["sums"].status
     renumbered = status.copy(data=np.where(status >= 2, status + 10, status))
     renumbered.attrs["flag_values"] = np.where(
         status.flag_values >= 2, status.flag_values + 10, status.flag_values
     )
-    data["seeds"]["status"] = renumbered
+    data["sums"]["status"] = renumbered
     assert_one_run(merge_maps([data]), of_seeds(replicas, 0, 3))

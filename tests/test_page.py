@@ -48,7 +48,7 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
         {one["name"]: one for one in found["observables"]},
     )
     dims = ("timestep", "packing_fraction", "restitution")
-    strain = data["seeds/strain"].sum("seed")
+    strain = data["sums/strain"].sum("seed")
     for name, observable in OBSERVABLES.items():
         if observable.tensor:
             for a, b in np.ndindex(2, 2):
@@ -164,7 +164,7 @@ def test_attribute_that_is_no_option_gives_no_command_to_paste(name: str) -> Non
     again = map_data(data)["again"]
     assert again["options"] == "--solver barzilai-borwein --activation midpoint --tolerance 0.0001"
     assert_same_numbers(
-        again["strain"], flattened(data)["seeds/strain"].mean("seed").sortby("timestep").values
+        again["strain"], flattened(data)["sums/strain"].mean("seed").sortby("timestep").values
     )
     jammed = flattened(data).assign(
         force_ratio=data.force_ratio.where(data.restitution > data.restitution.min())

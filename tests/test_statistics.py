@@ -11,7 +11,6 @@ from jaxgran.model.flow import steps_of_blocks
 from jaxgran.statistics import (
     correlation_length,
     drift,
-    error_correlation,
     jackknife,
     standard_errors,
 )
@@ -254,25 +253,6 @@ def test_blocks_that_differ_by_a_step_have_the_error_of_all_their_steps() -> Non
     assert np.std(value["ratio"]) == pytest.approx(expected, rel=4 / np.sqrt(2 * TRIALS))
     covered = np.mean(np.abs(value["ratio"] - 3) < 1.959964 * error["ratio"])
     assert covered > 0.95 - 4 * np.sqrt(0.95 * 0.05 / TRIALS)
-
-
-def test_errors_of_two_averages_are_correlated_as_their_blocks_are() -> None:
-    """A correlation of n blocks scatters by (1 - ρ²)/√n; that of an average with its reciprocal is
-    -1.
-    """
-    rng, correlation, blocks = np.random.default_rng(15), 0.6, (4, 32)
-    first, other = rng.normal(10, 1, (2, *blocks))
-    second = 10 + correlation * (first - 10) + np.sqrt(1 - correlation**2) * (other - 10)
-    sums = {"first": first, "second": second, "steps": np.ones(blocks), "same": np.ones(blocks)}
-
-    def estimate(sums: dict) -> dict:
-        mean = {name: sums[name] / sums["steps"] for name in ("first", "second", "same")}
-        return mean | {"reciprocal": 1 / mean["first"]}
-
-    found = error_correlation(estimate, sums)
-    assert found[0, 1] == pytest.approx(correlation, abs=4 * (1 - correlation**2) / np.sqrt(128))
-    assert found[0, 3] == pytest.approx(-1, abs=1e-3) and np.isnan(found[0, 2])
-    np.testing.assert_array_equal(found, found.T)
 
 
 def test_error_of_equal_blocks_and_of_an_unknown_value_is_unknown() -> None:

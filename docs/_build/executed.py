@@ -22,7 +22,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 ROOT = Path(__file__).parents[2]
-PAGES = ("tutorial.md",)
+PAGES = ("tutorial.md", "reference/map-file.md")
 _BLOCK = re.compile(r"^```(python|shell)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -41,7 +41,7 @@ def executed(markdown: str, name: str) -> tuple[str, dict[str, bytes]]:
         if figure:
             file = f"{name}_{len(files)}.png"
             files[file] = figure
-            shown.append(f"![What the code above draws]({file})")
+            shown.append(f"![What the code above draws]({Path(file).name})")
         return "\n\n".join(shown)
 
     with TemporaryDirectory() as folder, chdir(folder):

@@ -11,6 +11,8 @@ between two ``$$`` is a formula of TeX.
 mark in a page      replaced by
 ==================  ================================================================================
 {OBSERVABLES}       names, units and meanings of ``jaxgran/sampling/observables.py``
+{VARIABLES GROUP}   the rows of a group of ``jaxgran/maps/variables.py``
+{COORDINATES}       the coordinates of a map
 {OPTIONS COMMAND}   the options of a command
 {EXAMPLES COMMAND}  the examples of its ``--help``
 {BENCHMARKS}        the table of ``benchmarks/registry.py``
@@ -18,7 +20,9 @@ mark in a page      replaced by
 ==================  ================================================================================
 """
 
+import ast
 import importlib
+import inspect
 import re
 import runpy
 import sys
@@ -34,10 +38,14 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 from jaxgran.cli.mistakes import option_name, with_options
-from jaxgran.maps.settings import options as parameters
+from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.results import open_map
+from jaxgran.maps.schema import path_of
+from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.settings import options as parameters
+from jaxgran.maps.variables import COORDINATES, VARIABLES
 from jaxgran.page.explore import explore
-from jaxgran.sampling.observables import OBSERVABLES
+from jaxgran.sampling.observables import OBSERVABLES, Averages
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
@@ -75,7 +83,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     charts = "../" * name.count("/") + "charts/"
     markdown = re.sub(r"\{OPTIONS (\w+)\}", lambda mark: options(mark[1]), markdown)
     markdown = re.sub(r"\{EXAMPLES (\w+)\}", lambda mark: examples(mark[1]), markdown)
-    tables = {"{OBSERVABLES}": observables, "{BENCHMARKS}": lambda: benchmarks(charts), "{NOTEBOOKS}": list_of_notebooks}
+    markdown = re.sub(r"\{VARIABLES (\S+)\}", lambda mark: variables(mark[1]), markdown)
+    tables = {"{COORDINATES}": coordinates, "{OBSERVABLES}": observables, "{BENCHMARKS}": lambda: benchmarks(charts), "{NOTEBOOKS}": list_of_notebooks}
     for mark, table in tables.items():
         if mark in markdown:
             markdown = markdown.replace(mark, table())
@@ -99,10 +108,47 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
 def observables() -> str:
     """A table of what is measured."""
     rows = ["| name | unit | group in the file of a map | meaning |", "| --- | --- | --- | --- |"]
-    for name, one in OBSERVABLES.items():
-        unit, group = "–" if one.unit == "1" else one.unit, "root" if one.group == "/" else one.group
-        rows.append(f"| `{name}` | {unit} | {group} | {one.meaning} |")
+    for name, row in OBSERVABLES.items():
+        group = "root" if row.group == "/" else row.group
+        rows.append(f"| `{name}` | {unit_of(row.unit)} | {group} | {row.meaning} |")
     return "\n".join(rows)
+
+
+def unit_of(unit: str | None) -> str:
+    return "–" if unit in ("1", None) else unit
+
+
+def variables(group: str) -> str:
+    """A table of the variables of a group of a map, with the formulas of averages and the names of their errors."""
+    rows = {row.path.rpartition("/")[2]: row for row in VARIABLES if row.group == group}
+    data = map_dataset(MapSettings((0.5,), (0.6,), timestep=1e-3), {}, {})
+    names = map(str, data[group].data_vars) if group == "/" or group in data.children else ()
+    endings: dict[str, list[str]] = {name: [] for name in rows}
+    for name in names:
+        if name not in rows:
+            owner = max((row for row in rows if name.startswith(row)), key=len)
+            endings[owner].append(f"`{name.removeprefix(owner)}`")
+    lines = ["| name | dimensions | unit | meaning | formula | errors |", "| --- | --- | --- | --- | --- | --- |"]
+    for name, row in rows.items():
+        formula = f"`{formulas()[name]}`" if path_of(name) == row.path and name in OBSERVABLES else ""
+        dims = ", ".join(f"`{dim}`" for dim in row.dims)
+        lines.append(f"| `{name}` | {dims} | {unit_of(row.unit)} | {row.meaning} | {formula} | {', '.join(endings[name])} |")
+    return "\n".join(lines)
+
+
+def formulas() -> dict[str, str]:
+    """The formulas of the observables as they are written in their table."""
+    (table,) = ast.parse(inspect.getsource(Averages)).body
+    rows = {row.targets[0].id: row.value.args[1].body for row in table.body if isinstance(row, ast.Assign)}
+    return {name: re.sub(r"\b(s|xp)\.", "", ast.unparse(formula)) for name, formula in rows.items()}
+
+
+def coordinates() -> str:
+    """A table of the coordinates of a map."""
+    lines = ["| coordinate | unit | meaning |", "| --- | --- | --- |"]
+    for name, about in COORDINATES.items():
+        lines.append(f"| `{name}` | {unit_of(about.get('units'))} | {about['long_name']} |")
+    return "\n".join(lines)
 
 
 def table_of(command: str, kind: str) -> Any:

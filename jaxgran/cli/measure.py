@@ -114,7 +114,7 @@ def _say_imprecise(data) -> None:
     known = np.isfinite(errors).all(axis=0)
     if not known.any():
         return
-    strain = data["seeds/strain"].where(data["seeds/strain"] > 0)
+    strain = data["sums/strain"].where(data["sums/strain"] > 0)
     lost = f" of the {known.sum()} points with an error" if not known.all() else ""
     say(
         f"relative errors: {data.attrs['error']:g} requested, {errors[:, known].max():.2g} at the "
@@ -167,14 +167,14 @@ def finish(data, written: list[Path], interrupted: bool, output: Path | None = N
 
     A map that was interrupted goes on from the folder beside its output, if there is one.
     """
-    from jaxgran.maps.status_report import bad_points, format, format_short
+    from jaxgran.maps.status_report import bad_points, bad_points_message, short_samples_message
 
     say_written(written)
     _say_imprecise(data)
     bad = bad_points(data)
     short = bad.pop("short_sample", [])
     if short:
-        say(with_options(format_short(data, short), options("map")))
+        say(with_options(short_samples_message(data, short), options("map")))
     if interrupted:
         missing = (
             "" if data.status.size == 1 else f" with {len(bad.get('not_run', []))} points missing"
@@ -187,4 +187,4 @@ def finish(data, written: list[Path], interrupted: bool, output: Path | None = N
             saved = "finished points are saved."
         stop_interrupted(f"interrupted{missing}; {saved}")
     if bad:
-        stop(with_options(format(data, bad), options("map")), BAD_STATUS)
+        stop(with_options(bad_points_message(data, bad), options("map")), BAD_STATUS)

@@ -192,7 +192,7 @@ def _entries(data) -> dict[str, Entry]:
     entries |= {
         "grains": Entry(data.attrs["grains"], "number of grains"),
         "timestep": Entry(data.attrs["timestep"], "time step", "1 / shear rate"),
-        "strain": Entry(point["seeds/strain"].sum().values, "sampled strain of all seeds"),
+        "strain": Entry(point["sums/strain"].sum().values, "sampled strain of all seeds"),
         "engine": Entry(data.attrs["engine"], "program that advanced the flow", None),
         "solver": Entry(data.attrs["solver"], "method of the contact solve", None),
         "status": Entry(next(iter(bad_points(data)), "ok"), "worst status", None),
@@ -220,7 +220,7 @@ def _summary_table(data, all: bool) -> Table:
     kinetic theory.
     """
     from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
-    from jaxgran.maps.theory_variables import LENGTHS
+    from jaxgran.sampling.enskog_factors import LENGTHS
     from jaxgran.sampling.observables import GROUPS, OBSERVABLES
 
     grains, timestep, rule = (data.attrs[name] for name in ("grains", "timestep", "activation"))
@@ -237,7 +237,7 @@ def _summary_table(data, all: bool) -> Table:
     )
     table = Table(title, columns, numbers=False)
     point = flattened(data).isel(packing_fraction=0, restitution=0)
-    strain = float(point["seeds/strain"].sum())
+    strain = float(point["sums/strain"].sum())
     correlated = point["diagnostics/correlation_strain"].to_series().to_dict()
 
     def number(name: str) -> float:
@@ -260,7 +260,7 @@ def _summary_table(data, all: bool) -> Table:
                 ratio = with_error(*map(float, shear_stress_ratio(point)))
                 table.rows.append(["shear-stress ratio", ratio, "", "", ""])
             if name == "binary_dissipation_rate":
-                for length in (f"theory/{one}" for one in LENGTHS):
+                for length in (f"theory/{name}" for name in LENGTHS):
                     value = with_error(number(length), number(f"{length}_stderr"))
                     table.rows.append(
                         [length[7:].replace("_", " "), value, unit_text("sigma"), "", ""]

@@ -32,7 +32,7 @@ def to_attrs(settings: MapSettings) -> dict[str, Any]:
     numbers = solver_numbers(settings.solver)
     values = {row.name: getattr(settings, row.name) for row in fields(settings)} | {
         "equilibrate": "until steady" if settings.equilibrate is None else settings.equilibrate,
-        "strain": settings.strain if settings.error is None else None,  # seeds/strain has it
+        "strain": settings.strain if settings.error is None else None,  # sums/strain has it
         "tolerance": numbers["tolerance"],
         "solver": None,
         "engine": None,

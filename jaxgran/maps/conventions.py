@@ -26,37 +26,23 @@ metres per tonne squared, so such texts are not in ``units``.
 
 import xarray as xr
 
-from jaxgran.sampling.observables import GROUPS, OBSERVABLES, unit_attributes
+from jaxgran.sampling.observables import unit_attributes
 
 CONVENTIONS = "CF-1.11"
 _COMPANIONS = ("stderr", "ci95")
-_STATUS_NAMES = {"/": "aggregate_quality_flag", "seeds": "quality_flag"}
 
 
-def follow_conventions(data: xr.Dataset, group: str) -> xr.Dataset:
-    """A group whose variables have the attributes of the module; it comes with long names and units
-    in m, σ and t.
+def follow_conventions(data: xr.Dataset) -> xr.Dataset:
+    """A group with the attributes of the module; it comes with long names, units in m, σ and t,
+    cell methods of averages and standard names.
     """
     for name in map(str, data.variables):
         about = data[name].attrs
         if "units" in about:
             about |= unit_attributes(about["units"])
-        if name == "seed":
-            about["standard_name"] = "realization"
-        if name == "status":
-            about["standard_name"] = _STATUS_NAMES[group]
         linked = [f"{name}_{ending}" for ending in _COMPANIONS if f"{name}_{ending}" in data]
-        is_average = name in GROUPS.get(group, ())
-        if linked or is_average:
+        if linked or "cell_methods" in about:
             about["ancillary_variables"] = " ".join(
                 [*linked, "status" if "status" in data else "/status"]
             )
-        if is_average:
-            about["cell_methods"] = _cell_methods(name)
     return data
-
-
-def _cell_methods(name: str) -> str:
-    """How an observable is an average, in the vocabulary of CF."""
-    how = "maximum" if OBSERVABLES[name].extreme else "mean (ratio of sums over time steps)"
-    return f"realization: time: {how}"

@@ -2,12 +2,12 @@
 the run.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from jaxgran.dynamics.engine import select_engine, solver_in_use
@@ -15,45 +15,16 @@ from jaxgran.maps.attributes import to_attrs
 from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.confidence import confidence_variables
 from jaxgran.maps.conventions import CONVENTIONS, follow_conventions
-from jaxgran.maps.diagnostics import diagnostic_variables, observable_coordinate
 from jaxgran.maps.own_observables import own_variables
-from jaxgran.maps.points import PointAverages, PointGrid, point_averages
+from jaxgran.maps.point_values import PointValues
 from jaxgran.maps.provenance import made_with
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import ERROR_SOURCES, FORMAT_VERSION
-from jaxgran.maps.seeds import (
-    NOT_RUN,
-    STATUS_FLAGS,
-    replica_statuses,
-    seed_coordinate,
-    seed_variables,
-    worst_status,
-)
 from jaxgran.maps.settings import MapSettings
-from jaxgran.maps.states import first_of_points, state_variables
-from jaxgran.maps.sums import sum_variables
-from jaxgran.maps.theory_variables import theory_variables
-from jaxgran.model.status import Status
-from jaxgran.sampling.observables import GROUPS
+from jaxgran.maps.variables import COORDINATES, VARIABLES
 
-_AXES = {
-    "grains": {"long_name": "number of grains", "units": "1"},
-    "timestep": {"long_name": "time step of the sample", "units": "1 / shear rate"},
-    "packing_fraction": {"long_name": "packing fraction", "units": "1"},
-    "restitution": {"long_name": "restitution", "units": "1"},
-}
 _UNIFORM = "diameters uniform in 1 +- polydispersity, quantile midpoints; mass = diameter squared"
 _GIVEN = "the diameters over their mean, as many grains of each; mass = diameter squared"
-_TITLES = {
-    "stresses": "stress and dissipation by origin: contact forces, the same if collisions were "
-    "binary, peculiar motion",
-    "theory": "predictions of kinetic theory, and factors by which it fails",
-    "diagnostics": "quality of the contact solves, conservation of momentum and energy, "
-    "correlation of samples",
-    "seeds": "replicas of each point",
-    "sums": "running sums of each replica, from which all averages follow",
-    "states": "last state of one replica of every point",
-}
 
 
 def map_dataset(
@@ -64,49 +35,10 @@ def map_dataset(
     """The data of the finished replicas; points without any are NaN with the status ``not_run`` or
     ``failed``.
 
-    A point is (packing_fraction, restitution). If the settings have a list of numbers of grains or
-    of time steps, the dimensions grains and timestep come before these. Tensors have the dimensions
-    (axis_a, axis_b) last.
-
-    ============================  ====================  ============================================
-    root                          dimensions            meaning
-    ============================  ====================  ============================================
-    NAME, NAME_stderr             point                 average over all seeds and its standard
-                                                        error, for each observable of the root
-    NAME_ci95                     (point,               half-width of its 95 % interval for a large
-                                                        system, for the
-                                  error_source)         names in ``BUDGET``
-    NAME, NAME_stderr, NAME_ci95  point, …              only with the setting ``observe``, see
-                                                        ``own_variables``
-    status                        point                 worst status
-    correlation_strain            point                 strain over which the flow is correlated
-    ============================  ====================  ============================================
-
-    ============================  ==================================================================
-    group                         content
-    ============================  ==================================================================
-    stresses                      NAME and NAME_stderr for each observable of this group
-    theory                        see ``theory_variables``
-    diagnostics                   see ``diagnostic_variables``
-    seeds                         see ``seed_variables``
-    sums                          see ``sum_variables``
-    states                        only with the setting ``snapshots``, see ``state_variables``
-    ============================  ==================================================================
-
-    ============================  ====================  ============================================
-    coordinate                    dimensions            meaning
-    ============================  ====================  ============================================
-    packing_fraction,             of their own          values of the plane
-    restitution
-    grains, timestep              of their own or none  values of a list, or the one of all points
-    point_grains                  point                 number of grains, if it was chosen by point
-    error_source                  of its own            total, sampling, timestep, size, tolerance
-    seed                          of its own            0, 1, …: number of the replica, from
-                                                        ``first_seed`` on
-    observable                    of its own            name of an observable, in ``diagnostics``
-    axis_a, axis_b                of their own          "x" and "y": of the centre-to-centre vector,
-                                                        of the force
-    ============================  ====================  ============================================
+    Its variables and coordinates are the rows of ``maps.variables``; with them are the intervals of
+    ``confidence_variables`` and, with the setting ``observe``, ``own_variables``. A point is
+    (packing_fraction, restitution). If the settings have a list of numbers of grains or of time
+    steps, the dimensions grains and timestep come before these.
 
     Args:
       settings: the map.
@@ -115,79 +47,45 @@ def map_dataset(
       run: further attributes to store: command, wall time, speed; with ``engine`` and ``solver``
         also what ran, where that is not what this process would take.
     """
-    grid = PointGrid.of(settings)
-    averages, statuses = point_averages(settings, replicas), replica_statuses(settings, replicas)
-    groups = {
-        "/": _core(settings, grid, averages, statuses),
-        "stresses": xr.Dataset(
-            grid.averages(GROUPS["stresses"], averages.values, averages.stderrs)
-        ),
-        "theory": xr.Dataset(theory_variables(grid, averages.samples)),
-        "diagnostics": xr.Dataset(
-            diagnostic_variables(grid, averages), {"observable": observable_coordinate(averages)}
-        ),
-        "seeds": xr.Dataset(
-            seed_variables(settings, grid, replicas, statuses), {"seed": seed_coordinate(settings)}
-        ),
-    }
-    if any(replicas.values()):
-        groups["sums"] = xr.Dataset(sum_variables(settings, grid, replicas))
-    if settings.snapshots:
-        groups["states"] = xr.Dataset(state_variables(grid, first_of_points(replicas)))
-    tree = {name: follow_conventions(group, name) for name, group in groups.items()}
+    points = PointValues(settings, replicas)
+    grid, averages = points.grid, points.averages
+    groups: dict[str, dict[str, xr.Variable]] = defaultdict(dict)
+    for row in VARIABLES:
+        groups[row.group].update(row.on(points))
+    groups["/"] |= confidence_variables(grid, averages, settings.solver.tolerance)
+    groups["/"] |= own_variables(settings, grid, averages.samples)
+    coordinates = _coordinates(points)
     tree = {
-        name: group.assign_attrs(title=_TITLES[name]) if name in _TITLES else group
-        for name, group in tree.items()
+        group: follow_conventions(xr.Dataset(variables, coordinates.get(group)))
+        for group, variables in groups.items()
+        if variables
     }
     ran = {} if "engine" in run else what_runs(settings)
     tree["/"].attrs.update({**run_attributes(settings), **ran, **_history(run), **run})
     return xr.DataTree.from_dict(tree)
 
 
-def _core(
-    settings: MapSettings, grid: PointGrid, averages: PointAverages, statuses: np.ndarray
-) -> xr.Dataset:
-    """The root of a map: its main averages with errors, the status and the correlation strain of
-    every point.
-    """
-    worst = np.maximum(
-        worst_status(statuses), np.where(averages.drifting, Status.not_steady, NOT_RUN)
-    ).astype(np.int8)
-    about_status = {
-        "long_name": "worst status of a point, over all seeds and of their samples together"
-    }
-    about_strain = {
-        "long_name": "strain over which the flow is correlated, that of one sample",
-        "units": "1",
-    }
-    variables = {
-        **grid.averages(GROUPS["/"], averages.values, averages.stderrs),
-        **confidence_variables(grid, averages, settings.solver.tolerance),
-        **own_variables(settings, grid, averages.samples),
-        "status": grid.variable(worst, {**about_status, **STATUS_FLAGS}),
-        "correlation_strain": grid.variable(averages.correlation_strain, about_strain),
-    }
-    return xr.Dataset(variables, _coordinates(settings, grid))
+def _coordinates(points: PointValues) -> dict[str, dict[str, xr.Variable]]:
+    """The coordinates by the group that they belong to."""
+    settings, grid = points.settings, points.grid
+    single = {"timestep": settings.timestep, "grains": settings.grains}
+    labels = {"error_source": ERROR_SOURCES, "axis_a": ("x", "y"), "axis_b": ("x", "y")}
 
+    def along(name: str, values: Any) -> dict[str, xr.Variable]:
+        return {name: xr.Variable(name, list(values), COORDINATES[name])}
 
-def _coordinates(settings: MapSettings, grid: PointGrid) -> dict[str, xr.Variable]:
-    """The coordinates of the root."""
-    single: dict[str, Any] = {"timestep": settings.timestep, "grains": settings.grains}
-    coordinates = {
-        name: xr.Variable(name, list(values), _AXES[name]) for name, values in settings.axes.items()
-    }
+    root: dict[str, xr.Variable] = {}
+    for name, values in {**settings.axes, **labels}.items():
+        root |= along(name, values)
     for name, value in single.items():
         if name == "grains" and settings.grains_by_point is not None:
-            coordinates["point_grains"] = grid.variable(grid.grains, _AXES[name])
+            root["point_grains"] = grid.variable(grid.grains, COORDINATES["point_grains"])
         elif name not in settings.axes:
-            coordinates[name] = xr.Variable((), value, _AXES[name])
-    labels = {
-        "error_source": (list(ERROR_SOURCES), "source of an error"),
-        "axis_a": (["x", "y"], "direction of the centre-to-centre vector"),
-        "axis_b": (["x", "y"], "direction of the force"),
-    }
-    return coordinates | {
-        name: xr.Variable(name, x, {"long_name": words}) for name, (x, words) in labels.items()
+            root[name] = xr.Variable((), value, COORDINATES[name])
+    return {
+        "/": root,
+        "diagnostics": along("observable", points.averages.observable_correlation),
+        "sums": along("seed", range(settings.seeds)),
     }
 
 
@@ -245,7 +143,7 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
         "format_version": FORMAT_VERSION,
         **to_attrs(settings),
         "timestep_unit": "1 / shear rate",
-        "strain_meaning": "sampled strain of each seed; where none is given, see seeds/strain",
+        "strain_meaning": "sampled strain of each seed; where none is given, see sums/strain",
         "shear_rate": settings.flows()[0].shear_rate,
         "size_distribution": _UNIFORM if settings.diameters is None else _GIVEN,
         **({} if settings.part is None else {"part_points": points_of_part(settings)}),

@@ -54,7 +54,7 @@ def merge_maps(
       >>> settings = dict(restitution=[0.9], packing_fraction=[0.5], grains=16, seeds=1)
       >>> settings |= dict(strain=0.4, equilibrate=0.0)
       >>> merged = merge_maps([ratio_map(**settings), ratio_map(**settings, first_seed=1)])
-      >>> merged["seeds"].sizes["seed"]
+      >>> merged["sums"].sizes["seed"]
       2
     """
     path = (str, os.PathLike)

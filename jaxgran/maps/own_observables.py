@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from jaxgran.maps.schema import ERROR_SOURCES
 from jaxgran.model.checks import InputError, refused, short_repr
-from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.observe import digest_of, dimensions_of, observed_shapes
 from jaxgran.sampling.sample import observed_estimates
@@ -24,25 +22,6 @@ if TYPE_CHECKING:
     from jaxgran.maps.settings import MapSettings
     from jaxgran.model.flow import ShearFlow
     from jaxgran.sampling.sample import Sample
-
-_TAKEN = {
-    *OBSERVABLES,
-    "status",
-    "correlation_strain",
-    *("grains", "timestep", "packing_fraction", "restitution"),
-}
-_TAKEN |= {
-    "point_grains",
-    "error_source",
-    "axis_a",
-    "axis_b",
-    "stresses",
-    "theory",
-    "diagnostics",
-    "seeds",
-    "sums",
-}
-_TAKEN |= {"states"}
 
 
 def require_observe(observe: Any, flow: ShearFlow) -> None:
@@ -57,6 +36,8 @@ def require_observe(observe: Any, flow: ShearFlow) -> None:
         hash(observe)
     except TypeError:
         raise refused("observe", observe, "must be hashable") from None
+    from jaxgran.maps.variables import COORDINATES, VARIABLES  # which need the settings of a map
+
     shapes = observed_shapes(observe, flow)
     names = list(shapes) if isinstance(shapes, dict) else []
     if not names or not all(isinstance(x, jax.ShapeDtypeStruct) for x in shapes.values()):
@@ -67,7 +48,8 @@ def require_observe(observe: Any, flow: ShearFlow) -> None:
         raise InputError(
             f"observe must return names without spaces and signs, not {short_repr(names)}."
         )
-    taken = [name for name in names if name in _TAKEN or name.endswith(("_stderr", "_ci95"))]
+    of_map = {*OBSERVABLES, *COORDINATES, *(row.path.partition("/")[0] for row in VARIABLES)}
+    taken = [name for name in names if name in of_map or name.endswith(("_stderr", "_ci95"))]
     if taken:
         raise InputError(
             f"observe must return names that a map does not have, not {short_repr(taken[0])}."
@@ -98,22 +80,19 @@ def identity_of(settings: MapSettings) -> str | None:
 def own_variables(
     settings: MapSettings, grid: PointGrid, samples: Mapping[int, Sequence[Sample]]
 ) -> dict[str, xr.Variable]:
-    """The variables NAME, NAME_stderr and NAME_ci95 in the root, for what ``observe`` returns.
+    """The variables NAME and NAME_stderr in the root, for what ``observe`` returns.
 
-    An array has the dimensions NAME_dim_0, NAME_dim_1, … behind those of a point. Of the sources of
-    an error only that of sampling is known; NAME_ci95 is NaN for the others, and in total.
+    An array has the dimensions NAME_dim_0, NAME_dim_1, … behind those of a point.
     """
     if settings.observe is None:
         return {}
     variables = {}
-    found = {point: observed_estimates(seeds) for point, seeds in samples.items()}
+    estimates = {point: observed_estimates(seeds) for point, seeds in samples.items()}
     for name, sums in (sums_by_name(settings) or {}).items():
         dims = dimensions_of(name, sums.shape)
         value, stderr = (np.full((len(grid.flows), *sums.shape), np.nan) for _ in range(2))
-        for point, (values, stderrs) in found.items():
+        for point, (values, stderrs) in estimates.items():
             value[point], stderr[point] = values[name], stderrs[name]
-        interval = np.full((*value.shape, len(ERROR_SOURCES)), np.nan)
-        interval[..., ERROR_SOURCES.index("sampling")] = HALF_INTERVAL * stderr
         about = {
             "long_name": f"mean of {name} over all time steps",
             "cell_methods": "realization: time: mean",
@@ -121,9 +100,4 @@ def own_variables(
         variables[name] = grid.variable(value, about, *dims)
         about = {"long_name": f"standard error of the mean of {name}"}
         variables[f"{name}_stderr"] = grid.variable(stderr, about, *dims)
-        about = {
-            "long_name": f"half-width of the 95 % interval of the mean of {name}, known for "
-            "sampling only"
-        }
-        variables[f"{name}_ci95"] = grid.variable(interval, about, *dims, "error_source")
     return variables

@@ -1,6 +1,6 @@
 """The points of a map: their dimensions, and the averages of the replicas of each."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from jaxgran.model.status import GIVEN_UP
 from jaxgran.sampling.correlation_strain import flow_correlation_strain
 from jaxgran.sampling.drift import is_drifting
 from jaxgran.sampling.observables import OBSERVABLES
-from jaxgran.sampling.sample import Sample, correlation_strains, error_correlation_of, estimates
+from jaxgran.sampling.sample import Sample, correlation_strains, estimates
 
 
 @dataclass(frozen=True)
@@ -53,23 +53,6 @@ class PointGrid:
             (*self.dims, *further), values.reshape(*self.shape, *values.shape[1:]), dict(attrs)
         )
 
-    def averages(
-        self,
-        names: Iterable[str],
-        values: Mapping[str, np.ndarray],
-        stderrs: Mapping[str, np.ndarray] | None = None,
-    ) -> dict[str, xr.Variable]:
-        """The variables NAME and, where errors are given, NAME_stderr of some observables."""
-        variables = {}
-        for name in names:
-            one = OBSERVABLES[name]
-            about = {"long_name": one.meaning, "units": one.unit}
-            variables[name] = self.variable(values[name], about, *one.axes)
-            if stderrs is not None:
-                about = {"long_name": one.meaning_of_error, "units": one.unit}
-                variables[f"{name}_stderr"] = self.variable(stderrs[name], about, *one.axes)
-        return variables
-
 
 class PointAverages(NamedTuple):
     """Averages over the seeds of each point that were not given up, in the order of
@@ -80,8 +63,6 @@ class PointAverages(NamedTuple):
     correlation_strain            (points,)       strain over which the flow is correlated
     observable_correlation        (points,)       strain of one independent sample, for averages of
                                                   scalars, by name
-    friction_error_correlation    (points,)       of the errors of macroscopic_friction and
-                                                  inertial_number
     drifting                      (points,)       whether the averages still change
     samples                       by point        samples of these seeds
     ============================  ==============  ==================================================
@@ -91,7 +72,6 @@ class PointAverages(NamedTuple):
     stderrs: dict[str, np.ndarray]
     correlation_strain: np.ndarray
     observable_correlation: dict[str, np.ndarray]
-    friction_error_correlation: np.ndarray
     drifting: np.ndarray
     samples: dict[int, Sequence[Sample]]
 
@@ -100,32 +80,30 @@ def point_averages(settings: MapSettings, replicas: Mapping[Key, Replica | None]
     """The averages of every point over its replicas that were not given up."""
     flows = settings.flows()
     count = len(flows)
-    scalars = [name for name, one in OBSERVABLES.items() if not (one.extreme or one.tensor)]
-    found = PointAverages(
-        values={name: np.full((count, *one.shape), np.nan) for name, one in OBSERVABLES.items()},
-        stderrs={name: np.full((count, *one.shape), np.nan) for name, one in OBSERVABLES.items()},
+    scalars = [name for name, row in OBSERVABLES.items() if not (row.extreme or row.tensor)]
+    averages = PointAverages(
+        values={name: np.full((count, *row.shape), np.nan) for name, row in OBSERVABLES.items()},
+        stderrs={name: np.full((count, *row.shape), np.nan) for name, row in OBSERVABLES.items()},
         correlation_strain=np.full(count, np.nan),
         observable_correlation={name: np.full(count, np.nan) for name in scalars},
-        friction_error_correlation=np.full(count, np.nan),
         drifting=np.zeros(count, bool),
         samples=_samples(settings, replicas),
     )
-    for point, samples in found.samples.items():
+    for point, samples in averages.samples.items():
         flow, (values, stderrs) = flows[point], estimates(samples)
         for name in OBSERVABLES:
-            found.values[name][point], found.stderrs[name][point] = values[name], stderrs[name]
+            averages.values[name][point] = values[name]
+            averages.stderrs[name][point] = stderrs[name]
         mass = _mass(settings, flow)
         area, shear_rate = samples[0].area, samples[0].shear_rate
-        strain = found.correlation_strain[point] = flow_correlation_strain(
+        strain = averages.correlation_strain[point] = flow_correlation_strain(
             values, flow.grains, mass, area, shear_rate
         )
-        found.drifting[point] = is_drifting(samples, float(strain))
-        correlation = error_correlation_of(samples, "macroscopic_friction", "inertial_number")
-        found.friction_error_correlation[point] = correlation
+        averages.drifting[point] = is_drifting(samples, float(strain))
         independent = correlation_strains(samples)
         for name in scalars:
-            found.observable_correlation[name][point] = independent[name]
-    return found
+            averages.observable_correlation[name][point] = independent[name]
+    return averages
 
 
 def _mass(settings: MapSettings, flow: ShearFlow) -> float:
@@ -147,7 +125,7 @@ def _samples(
     by_point: dict[int, Sequence[Sample]] = {}
     for point in range(len(settings.flows())):
         seeds = [replicas.get((point, seed)) for seed in range(settings.seeds)]
-        samples = [one.sample for one in seeds if one is not None and one.status < GIVEN_UP]
+        samples = [x.sample for x in seeds if x is not None and x.status < GIVEN_UP]
         if samples:
             by_point[point] = samples
     return by_point

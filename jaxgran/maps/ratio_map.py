@@ -29,7 +29,12 @@ from jaxgran.maps.replica import Advance, Key, Replica
 from jaxgran.maps.run_replicas import run_replicas
 from jaxgran.maps.settings import OPTIONS, MapSettings, RunOptions, table
 from jaxgran.maps.settings_checks import require_engine
-from jaxgran.maps.status_report import BadPoints, bad_points, format, format_short
+from jaxgran.maps.status_report import (
+    BadPoints,
+    bad_points,
+    bad_points_message,
+    short_samples_message,
+)
 from jaxgran.maps.store import Store, open_store, replica_count
 from jaxgran.model.checks import refused
 from jaxgran.model.choices import Activation
@@ -240,6 +245,6 @@ def _warn_of_bad_points(data: xr.DataTree) -> None:
     bad.pop("failed", None)  # batches that were given up have had a warning of their own
     short = bad.pop("short_sample", [])
     if short:
-        warnings.warn(format_short(data, short), BadPoints, stacklevel=4)
+        warnings.warn(short_samples_message(data, short), BadPoints, stacklevel=4)
     if bad:
-        warnings.warn(format(data, bad), BadPoints, stacklevel=4)
+        warnings.warn(bad_points_message(data, bad), BadPoints, stacklevel=4)

@@ -74,7 +74,7 @@ def _whole(path: Path) -> bytes:
 
 def is_finished(data: xr.DataTree) -> bool:
     """Whether a map has all its replicas."""
-    status = data["seeds"].status
+    status = data["sums"].status
     flags = dict(
         zip(status.attrs["flag_meanings"].split(), status.attrs["flag_values"], strict=True)
     )
@@ -91,14 +91,14 @@ def differences(data: xr.DataTree) -> list[str]:
     """
     from jaxgran.maps.provenance import made_with
 
-    here = made_with()
+    process = made_with()
     names = [
         name
-        for name in here
+        for name in process
         if name.startswith("version_") or name in ("device", "precision", "commit", "code_digest")
     ]
     return [
-        f"{name.replace('_', ' ')} {data.attrs[name]} there, {here[name]} here"
+        f"{name.replace('_', ' ')} {data.attrs[name]} there, {process[name]} here"
         for name in names
-        if name in data.attrs and data.attrs[name] != here[name]
+        if name in data.attrs and data.attrs[name] != process[name]
     ]

@@ -16,7 +16,7 @@ import xarray as xr
 from jaxgran.model.checks import InputError
 from jaxgran.sampling.observables import OBSERVABLES, TENSOR_AXES
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 """Version of the groups and names in the data of a map; a file of another one is refused."""
 
 MapData: TypeAlias = xr.DataTree | xr.Dataset
@@ -126,16 +126,16 @@ def parts(data: MapData) -> list[xr.Dataset]:
     """The parts of a map for each number of grains and time step, flattened; these become
     attributes of the part.
     """
-    found = [flattened(data)]
+    selected = [flattened(data)]
     for name in FINEST:
-        if name in found[0].dims:
-            values = found[0][name].values.tolist()
-            found = [
+        if name in selected[0].dims:
+            values = selected[0][name].values.tolist()
+            selected = [
                 part.isel({name: k}).assign_attrs({name: x})
-                for part in found
+                for part in selected
                 for k, x in enumerate(values)
             ]
-    return found
+    return selected
 
 
 def relative_ci95(data: MapData, name: str) -> dict[str, np.ndarray]:

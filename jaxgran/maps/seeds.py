@@ -3,9 +3,7 @@
 from collections.abc import Mapping
 
 import numpy as np
-import xarray as xr
 
-from jaxgran.maps.points import PointGrid
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
@@ -37,43 +35,13 @@ def worst_status(statuses: np.ndarray) -> np.ndarray:
     ).astype(np.int8)
 
 
-def seed_variables(
-    settings: MapSettings,
-    grid: PointGrid,
-    replicas: Mapping[Key, Replica | None],
-    statuses: np.ndarray,
-) -> dict[str, xr.Variable]:
-    """The group ``seeds``: variables along the dimension ``seed``.
-
-    ====================  ==========================================================================
-    variable              meaning
-    ====================  ==========================================================================
-    status                status of the replica
-    strain                sampled strain
-    equilibration_strain  strain before the sample
-    ====================  ==========================================================================
-    """
-    shape = (len(grid.flows), settings.seeds)
-    strain, equilibration = (np.full(shape, np.nan) for _ in range(2))
+def seed_strains(
+    settings: MapSettings, replicas: Mapping[Key, Replica | None]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The sampled strain and the strain before the sample of every replica, (points, seeds)."""
+    sampled, before = (np.full((len(settings.flows()), settings.seeds), np.nan) for _ in range(2))
     for key, replica in replicas.items():
-        if replica is None:
-            continue
-        equilibration[key] = replica.strain
-        strain[key] = replica.sample.tally.duration.sum() * replica.sample.shear_rate
-    about = {
-        "strain": (strain, {"long_name": "sampled strain", "units": "1"}),
-        "equilibration_strain": (
-            equilibration,
-            {"long_name": "strain sheared before the sample", "units": "1"},
-        ),
-    }
-    variables = {"status": grid.variable(statuses, {"long_name": "status", **STATUS_FLAGS}, "seed")}
-    return variables | {
-        name: grid.variable(column, attrs, "seed") for name, (column, attrs) in about.items()
-    }
-
-
-def seed_coordinate(settings: MapSettings) -> xr.Variable:
-    """The numbers of the seeds."""
-    about = {"long_name": "seed of the random numbers, from the first", "units": "1"}
-    return xr.Variable("seed", np.arange(settings.seeds), about)
+        if replica is not None:
+            before[key] = replica.strain
+            sampled[key] = replica.sample.tally.duration.sum() * replica.sample.shear_rate
+    return sampled, before

@@ -28,11 +28,11 @@ def bad_points(data: MapData) -> dict[str, list[str]]:
     )
     bad: dict[str, list[str]] = {}
     if "part_points" in data.attrs:  # the other points are those of other parts
-        own = np.isin(np.arange(data.status.size), data.attrs["part_points"]).reshape(
+        in_part = np.isin(np.arange(data.status.size), data.attrs["part_points"]).reshape(
             data.status.shape
         )
         data = flattened(data).assign(
-            status=data.status.where(own, 0).assign_attrs(data.status.attrs)
+            status=data.status.where(in_part, 0).assign_attrs(data.status.attrs)
         )
     for part in parts(data):
         which = f", {part.attrs['grains']} grains" if "grains" in data.dims else ""
@@ -47,7 +47,7 @@ def bad_points(data: MapData) -> dict[str, list[str]]:
     return bad
 
 
-def format(data: MapData, bad: dict[str, list[str]]) -> str:
+def bad_points_message(data: MapData, bad: dict[str, list[str]]) -> str:
     """How many points have a bad status, which ones, and what to do."""
     failed = sum(map(len, bad.values()))
     count = "the flow" if data.status.size == 1 else f"{failed} of {data.status.size} points"
@@ -56,7 +56,7 @@ def format(data: MapData, bad: dict[str, list[str]]) -> str:
     return f"{count} failed: {'; '.join(parts)}. Meaning: {'; '.join(hints)}."
 
 
-def format_short(data: MapData, points: list[str]) -> str:
+def short_samples_message(data: MapData, points: list[str]) -> str:
     """Which samples are shorter than a few correlation strains, and the strain that they need."""
     code = data.status.attrs["flag_meanings"].split().index("short_sample")
     short = data.status == data.status.attrs["flag_values"][code]

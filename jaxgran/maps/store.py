@@ -34,7 +34,7 @@ class Store(NamedTuple):
         """Write a map in which something was measured, but no interrupted one over a finished
         one.
         """
-        if self.output is None or "sums" not in data.children:
+        if self.output is None or "tally" not in data["sums"]:
             return
         if not interrupted or self.finished is None:
             results.write_dataset(data, self.output)

@@ -22,34 +22,21 @@ from jaxgran.sampling.sample import Sample
 
 def sum_variables(
     settings: MapSettings, grid: PointGrid, replicas: Mapping[Key, Replica | None]
-) -> dict[str, xr.Variable]:
-    """The group ``sums``.
-
-    ========  ==============================  ======================================================
-    variable  dimensions                      meaning
-    ========  ==============================  ======================================================
-    tally     (point, seed, block, quantity)  the numbers of the ``Tally`` of each block of a
-                                              sample, in the order of its fields, and behind them
-                                              the sums of the user's observables
-    area      (point, seed)                   area of the cell
-    ========  ==============================  ======================================================
+) -> dict[str, np.ndarray]:
+    """The values of ``sums/tally`` (points, seeds, blocks, quantities) and ``sums/area`` (points,
+    seeds); none without a replica.
     """
     flat = {}
     for key, replica in replicas.items():
         if replica is not None:
             flat[key] = flat_tally(replica.sample.tally, np.shape(replica.sample.tally.steps))
+    if not flat:
+        return {}
     shape = (len(grid.flows), settings.seeds)
     sums, area = np.full((*shape, *next(iter(flat.values())).shape), np.nan), np.full(shape, np.nan)
     for key, numbers in flat.items():
         sums[key], area[key] = numbers, replicas[key].sample.area  # type: ignore[union-attr]
-    about = {
-        "long_name": "running sums of each block of a sample, in the order of the fields of Tally",
-        "units": "1",
-    }
-    about_area = {"long_name": "area of the cell", "units": "sigma^2"}
-    tally = grid.variable(sums, about, "seed", "block", "quantity")
-    tally.encoding = {"zlib": True, "shuffle": True, "complevel": 4}
-    return {"tally": tally, "area": grid.variable(area, about_area, "seed")}
+    return {"tally": sums, "area": area}
 
 
 def replicas_of(data: xr.DataTree, settings: MapSettings) -> dict[Key, Replica | None]:
@@ -59,20 +46,20 @@ def replicas_of(data: xr.DataTree, settings: MapSettings) -> dict[Key, Replica |
     Raises:
       InputError: (a ValueError) the data have no sums.
     """
-    if "sums" not in data.children:
+    if "sums" not in data.children or "tally" not in data["sums"]:
         raise InputError("data must have the group sums, which maps of this version have.")
     flows = settings.flows()
     shape, numbers = (len(flows), settings.seeds), flattened(data)
     status, strain, area = (
         numbers[name].values.reshape(shape)
-        for name in ("seeds/status", "seeds/equilibration_strain", "sums/area")
+        for name in ("sums/status", "sums/equilibration_strain", "sums/area")
     )
     flags = numbers[
-        "seeds/status"
+        "sums/status"
     ].attrs  # those of the file, which an earlier version may have written
     for value, name in zip(flags["flag_values"], flags["flag_meanings"].split(), strict=True):
         own = Status[name] if name in Status.__members__ else NOT_RUN
-        status = np.where(numbers["seeds/status"].values.reshape(shape) == value, own, status)
+        status = np.where(numbers["sums/status"].values.reshape(shape) == value, own, status)
     sums = numbers["sums/tally"].values
     sums = sums.reshape(*shape, *sums.shape[-2:])
     dtype, own_sums = np.dtype(str(data.attrs["precision"])), sums_by_name(settings)

@@ -184,7 +184,7 @@ def _effective_samples(data: xr.Dataset, observable: str) -> xr.DataArray | None
     """The number of independent samples of an observable at each point, or None where it is not
     known.
     """
-    strain, correlated = data.get("seeds/strain"), data.get("diagnostics/correlation_strain")
+    strain, correlated = data.get("sums/strain"), data.get("diagnostics/correlation_strain")
     if strain is None or correlated is None or observable not in data.get("observable", ()):
         return None
     return strain.sum("seed") / correlated.sel(observable=observable)
@@ -244,11 +244,11 @@ def _instants(
     """
     if not any(name.startswith("states/") for name in map(str, data.data_vars)):
         return None, []
-    from jaxgran.maps.states import VARIABLES, instant_at, state_of  # here, as only this needs JAX
+    from jaxgran.maps.states import FIELDS, instant_at, state_of  # here, as only this needs JAX
 
     timesteps, values = (
         _axis(data, "timestep"),
-        {name: data.get(f"states/{name}") for name in VARIABLES},
+        {name: data.get(f"states/{name}") for name in FIELDS},
     )
     activation = data.attrs.get("activation")
     if (
@@ -284,7 +284,7 @@ def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
     """
     if (
         not {"seeds", "tolerance", *_NAMED} <= data.attrs.keys() | {"engine"}
-        or "seeds/strain" not in data
+        or "sums/strain" not in data
     ):
         return None
     chosen = {}
@@ -303,7 +303,7 @@ def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
         return None
     words = [f"--{name} {value}" for name, value in chosen.items() if value != "auto"]
     strain = _column(
-        data["seeds/strain"].mean("seed").where(np.isfinite(data.force_ratio)), data, dims
+        data["sums/strain"].mean("seed").where(np.isfinite(data.force_ratio)), data, dims
     )
     return {"seeds": seeds, "options": " ".join(words), "strain": numbers(strain)}
 

@@ -71,6 +71,12 @@ FACTORS = {  # what is measured, and what is assumed in its place
     "pairs": ("the measured pairs at contact", "those of equilibrium"),
     "binary": ("the measured impulses", "those of binary collisions"),
 }
+LENGTHS = {
+    "correlation_length": "Enskog's dissipation rate over the measured one, at the local "
+    "temperature",
+    "correlation_length_from_pressure": "the same quotient of the dissipation rates over the "
+    "contact pressures",
+}
 _SPEEDS = {
     "pressure": ("pressure", 2),
     "shear_stress": ("shear_stress", 2),
@@ -99,7 +105,7 @@ def measured_over_enskog(
         dissipation rate of elastic grains.
     """
     sums = jax.tree.map(
-        lambda *x: np.stack([np.asarray(one) for one in x]), *(seed.tally for seed in seeds)
+        lambda *x: np.stack([np.asarray(part) for part in x]), *(seed.tally for seed in seeds)
     )
     return standard_errors(
         partial(_factors, flow, grains, np.asarray(seeds[0].area)), sums, durations(seeds)
@@ -118,29 +124,29 @@ def _factors(
     granular = np.trace(tensor, axis1=1, axis2=2)[:, None, None] / 2
     local = (tally.local_kinetic / tally.duration)[:, None, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        tensors = granular * np.eye(2), local * np.eye(2), local / granular * tensor
+        temperatures = granular * np.eye(2), local * np.eye(2), local / granular * tensor
         (enskog, _), (isotropic, _), (chaotic, chaotic_speeds) = (
-            _enskog(flow, grains, one) for one in tensors
+            _enskog(flow, grains, tensor) for tensor in temperatures
         )
-        found = {}
+        factors = {}
         for name, (weight, power) in _SPEEDS.items():
             speed = speeds[weight] / binary[weight] * chaotic[weight] / chaotic_speeds[weight]
-            factors = {
+            of_rate = {
                 "local_temperature": isotropic[name] / enskog[name],
                 "anisotropy": chaotic[name] / isotropic[name],
                 "chaos": speed**power,
                 "pairs": binary[name] / chaotic[name] / speed**power,
                 "binary": measured[name] / binary[name],
             }
-            found |= {f"{name}_{factor}": x for factor, x in factors.items()} | {
+            factors |= {f"{name}_{factor}": x for factor, x in of_rate.items()} | {
                 f"enskog_{name}": enskog[name]
             }
         length = chaotic["dissipation_rate"] / measured["dissipation_rate"]
-        found["correlation_length"] = length
-        found["correlation_length_from_pressure"] = (
+        factors["correlation_length"] = length
+        factors["correlation_length_from_pressure"] = (
             length * measured["pressure"] / chaotic["pressure"]
         )
-    return {name: np.where(np.isfinite(x), x, np.nan) for name, x in found.items()}
+    return {name: np.where(np.isfinite(x), x, np.nan) for name, x in factors.items()}
 
 
 def _rates(stress: Array | np.ndarray, dissipation_rate: Array | np.ndarray) -> dict[str, Any]:
@@ -174,10 +180,12 @@ def _enskog(
     )
     classes = None if grains is None else size_classes(grains)
     parts = [_collisional_transfer(part, classes, *numbers) for part in filled]
-    found = jax.tree.map(
-        lambda *x: np.concatenate([np.asarray(one, np.float64) for one in x])[:count], *parts
+    collisions = jax.tree.map(
+        lambda *x: np.concatenate([np.asarray(part, np.float64) for part in x])[:count], *parts
     )
-    return _rates(found.stress, found.dissipation_rate), _stresses(found.speed_stress)
+    return _rates(collisions.stress, collisions.dissipation_rate), _stresses(
+        collisions.speed_stress
+    )
 
 
 @persistent_jit

@@ -1,14 +1,17 @@
-"""Observables: the averages of a sample, one row each. Their formulas are in ``averages``.
+"""Observables: the averages of a sample, one row each.
 
 Nothing here needs JAX, so that files are read without loading it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, overload
 
 if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Array
+
+    from jaxgran.sampling.averages import Sums
 
 STRESS_UNIT = (
     "m / t^2"  # in two dimensions; t is the time unit of the shear rate, 1/shear rate by default
@@ -22,6 +25,7 @@ class Average:
 
     Args:
       meaning: what it is, without its unit.
+      formula: its value from the ``Sums`` of a sample, which have the other observables by name.
       unit: "1" for a pure number.
       group: of the file of a map, "/" for its root; the tables of ``jaxgran run`` have the same
         groups.
@@ -31,6 +35,7 @@ class Average:
     """
 
     meaning: str
+    formula: "Callable[[Sums], Any]"
     unit: str = "1"
     group: str = "/"
     tensor: bool = False
@@ -69,90 +74,154 @@ class Average:
 
 class Averages:
     """Every observable as an attribute, from the mapping ``averages``: this is the table of all
-    observables.
+    observables, and a row is all that one needs.
     """
 
-    force_ratio = Average("mean contact force over mean binary contact force")
-    stress_ratio = Average("contact stress over binary stress, by component", tensor=True)
-    pressure = Average("pressure, contact and kinetic", STRESS_UNIT)
-    shear_stress = Average("shear stress, contact and kinetic, positive", STRESS_UNIT)
-    macroscopic_friction = Average("shear stress over pressure")
-    inertial_number = Average(
-        "shear rate times the square root of the mass of a mean grain over the pressure"
+    force_ratio = Average(
+        "mean contact force over mean binary contact force",
+        lambda s: s.ratio(s.tally.impulse, s.tally.binary_impulse),
     )
-    granular_temperature = Average("granular temperature, sum of m c^2 over 2 N", "m sigma^2 / t^2")
+    stress_ratio = Average(
+        "contact stress over binary stress, by component",
+        lambda s: s.ratio(s.contact_stress, s.binary_stress),
+        tensor=True,
+    )
+    pressure = Average(
+        "pressure, contact and kinetic",
+        lambda s: s.contact_pressure + s.kinetic_pressure,
+        STRESS_UNIT,
+    )
+    shear_stress = Average(
+        "shear stress, contact and kinetic, positive",
+        lambda s: -s.contact_stress[..., 0, 1] - s.kinetic_stress[..., 0, 1],
+        STRESS_UNIT,
+    )
+    macroscopic_friction = Average(
+        "shear stress over pressure", lambda s: s.shear_stress / s.pressure
+    )
+    inertial_number = Average(
+        "shear rate times the square root of the mass of a mean grain over the pressure",
+        lambda s: s.shear_rate / s.xp.sqrt(s.pressure),
+    )
+    granular_temperature = Average(
+        "granular temperature, sum of m c^2 over 2 N",
+        lambda s: s.kinetic_pressure * s.area / s.grains,
+        "m sigma^2 / t^2",
+    )
     local_granular_temperature = Average(
         "granular temperature relative to the mean velocity of boxes of about 25 grains",
+        lambda s: s.ratio(s.tally.local_kinetic, s.tally.duration),
         "m sigma^2 / t^2",
     )
     coordination_number = Average(
-        "contacts per grain that carry an impulse (twice their number over the grains)"
+        "contacts per grain that carry an impulse (twice their number over the grains)",
+        lambda s: 2 * s.tally.loaded_contacts / (s.grains * s.tally.steps),
     )
     collision_rate = Average(
-        "approaching contacts per grain and unit strain, each grain counting its own"
+        "approaching contacts per grain and unit strain, each grain counting its own",
+        lambda s: 2 * s.tally.collisions / (s.grains * s.tally.duration * s.shear_rate),
     )
 
     contact_stress = Average(
-        "stress of the contact forces", STRESS_UNIT, group="stresses", tensor=True
+        "stress of the contact forces",
+        lambda s: s.tally.contact_moment / s.volume[..., None, None],
+        STRESS_UNIT,
+        "stresses",
+        tensor=True,
     )
     binary_stress = Average(
         "stress of the contact forces if collisions were binary",
+        lambda s: s.tally.binary_moment / s.volume[..., None, None],
         STRESS_UNIT,
-        group="stresses",
+        "stresses",
         tensor=True,
     )
     kinetic_stress = Average(
-        "stress of the peculiar motion", STRESS_UNIT, group="stresses", tensor=True
+        "stress of the peculiar motion",
+        lambda s: s.tally.kinetic_moment / s.volume[..., None, None],
+        STRESS_UNIT,
+        "stresses",
+        tensor=True,
     )
     dissipation_rate = Average(
-        "energy that contacts lose per unit area and time", "m / t^3", group="stresses"
+        "energy that contacts lose per unit area and time",
+        lambda s: s.tally.dissipation / s.volume,
+        "m / t^3",
+        "stresses",
     )
     binary_dissipation_rate = Average(
-        "energy that contacts would lose if collisions were binary", "m / t^3", group="stresses"
+        "energy that contacts would lose if collisions were binary",
+        lambda s: s.tally.binary_dissipation / s.volume,
+        "m / t^3",
+        "stresses",
     )
     cluster_pressure_share = Average(
-        "share of the contact pressure in clusters of three or more grains", group="stresses"
+        "share of the contact pressure in clusters of three or more grains",
+        lambda s: s.ratio(s.trace(s.tally.cluster_moment), s.trace(s.tally.contact_moment)),
+        group="stresses",
     )
     cluster_shear_share = Average(
-        "share of the contact shear stress in clusters of three or more grains", group="stresses"
+        "share of the contact shear stress in clusters of three or more grains",
+        lambda s: s.ratio(s.tally.cluster_moment[..., 0, 1], s.tally.contact_moment[..., 0, 1]),
+        group="stresses",
     )
 
-    iterations = Average("solver iterations per solved network", group="diagnostics")
+    iterations = Average(
+        "solver iterations per solved network",
+        lambda s: s.ratio(s.tally.iterations, s.tally.solves),
+        group="diagnostics",
+    )
     worst_residual = Average(
-        "largest relative residual of a solved network", group="diagnostics", extreme=True
+        "largest relative residual of a solved network",
+        lambda s: s.tally.worst_residual,
+        group="diagnostics",
+        extreme=True,
     )
     unconverged_share = Average(
-        "share of the solved networks that ended above the tolerance", group="diagnostics"
+        "share of the solved networks that ended above the tolerance",
+        lambda s: s.ratio(s.tally.unconverged, s.tally.solves),
+        group="diagnostics",
     )
     mean_overlap = Average(
-        "mean overlap of the contacts of a solved network", "sigma", group="diagnostics"
+        "mean overlap of the contacts of a solved network",
+        lambda s: s.ratio(s.tally.overlap, s.tally.contacts),
+        "sigma",
+        "diagnostics",
     )
     max_overlap = Average(
-        "largest overlap of a contact", "sigma", group="diagnostics", extreme=True
+        "largest overlap of a contact",
+        lambda s: s.tally.largest_overlap,
+        "sigma",
+        "diagnostics",
+        extreme=True,
     )
     momentum_drift = Average(
         "largest total momentum over the sum of the momenta of the grains",
+        lambda s: s.tally.momentum_drift,
         group="diagnostics",
         extreme=True,
     )
     energy_balance_error = Average(
         "shear work less dissipation and growth of the kinetic energy, over shear work",
+        lambda s: s.ratio(s.work - s.tally.dissipation - s.tally.energy_change, s.xp.abs(s.work)),
         group="diagnostics",
     )
     complementarity_power = Average(
         "sum of p (u+ + alpha u-)/2, which an exact solve makes zero, over shear work",
+        lambda s: s.ratio(s.tally.complementarity, s.xp.abs(s.work)),
         group="diagnostics",
     )
     longwave_energy_ratio = Average(
         "kinetic energy of the four longest waves of velocity over that of equipartition",
+        lambda s: s.ratio(s.tally.wave_kinetic, s.granular_temperature * s.tally.duration),
         group="diagnostics",
     )
 
 
-OBSERVABLES = {name: one for name, one in vars(Averages).items() if isinstance(one, Average)}
+OBSERVABLES = {name: row for name, row in vars(Averages).items() if isinstance(row, Average)}
 GROUPS = {
-    group: tuple(name for name, one in OBSERVABLES.items() if one.group == group)
-    for group in dict.fromkeys(one.group for one in OBSERVABLES.values())
+    group: tuple(name for name, row in OBSERVABLES.items() if row.group == group)
+    for group in dict.fromkeys(row.group for row in OBSERVABLES.values())
 }
 """Names of the observables by their group in the file of a map."""
 

@@ -25,7 +25,6 @@ from jaxgran.sampling.observables import OBSERVABLES, Averages
 from jaxgran.statistics import (
     Estimates,
     correlation_length,
-    error_correlation,
     merged_blocks,
     standard_errors,
 )
@@ -253,17 +252,6 @@ def correlation_strains(seeds: Sequence[Sample]) -> Estimates:
     return {
         name: length * block for name, length in lengths.items() if not OBSERVABLES[name].extreme
     }
-
-
-def error_correlation_of(seeds: Sequence[Sample], first: str, second: str) -> float:
-    """Correlation of the errors of two averages over replicas of one flow."""
-    average, sums = _stacked(seeds)
-
-    def pair(sums: Tally) -> dict[str, Array]:
-        found = average(sums)
-        return {name: found[name] for name in (first, second)}
-
-    return float(error_correlation(pair, sums, durations(seeds))[0, 1])
 
 
 def durations(seeds: Sequence[Sample]) -> np.ndarray:

@@ -20,10 +20,10 @@ def dataset_of(sample: "Sample") -> xr.Dataset:
     replicas = ("replica",) * np.ndim(sample.area)
     values, errors = sample.averages, sample.errors()
     variables: dict[str, Any] = {}
-    for name, one in OBSERVABLES.items():
-        dims = (*replicas, *one.axes)
-        variables[name] = dims, values[name], _about(one.meaning, one.unit)
-        variables[f"{name}_stderr"] = dims, errors[name], _about(one.meaning_of_error, one.unit)
+    for name, row in OBSERVABLES.items():
+        dims = (*replicas, *row.axes)
+        variables[name] = dims, values[name], _about(row.meaning, row.unit)
+        variables[f"{name}_stderr"] = dims, errors[name], _about(row.meaning_of_error, row.unit)
     flags = {
         "flag_values": np.array([*Status], np.int8),
         "flag_meanings": " ".join(status.name for status in Status),
@@ -56,7 +56,7 @@ def _own_variables(sample: "Sample", replicas: tuple[str, ...]) -> dict[str, Any
     each = [sample[k].observed() for k in range(len(sample))] if replicas else [sample.observed()]
     variables = {}
     for name in sums:
-        means, errors = (np.stack([one[kind][name] for one in each]) for kind in (0, 1))
+        means, errors = (np.stack([estimate[kind][name] for estimate in each]) for kind in (0, 1))
         dims = (*replicas, *dimensions_of(name, means.shape[1:]))
         for key, numbers, meaning in (
             (name, means, "mean"),
