@@ -67,35 +67,6 @@ def test_start_has_the_temperature_asked_for_and_no_momentum(keys) -> None:
     assert np.all(state.tilt == 0)
 
 
-def test_steady_noise_is_accepted_at_the_rate_of_its_criterion() -> None:
-    # Two errors hold 95.4 % of a Gaussian, and fewer where the error itself comes from few values.
-    rng = np.random.default_rng(0)
-    for length, least in ((6, 0.85), (40, 0.93)):
-        levels = [steady_state._is_level(0.05 * rng.normal(size=length)) for _ in range(2000)]
-        assert np.mean(levels) > least - 4 * np.sqrt(least * (1 - least) / 2000)
-
-
-def test_a_drifting_record_is_refused() -> None:
-    rng = np.random.default_rng(1)
-    for length in (6, 20, 40):
-        drifting = np.linspace(0.0, 1.0, length) + 0.05 * rng.normal(size=(200, length))
-        relaxing = np.exp(-np.linspace(0.0, 2.0, length)) + 0.01 * rng.normal(size=(200, length))
-        assert not any(steady_state._is_level(one) for one in drifting)
-        assert not any(steady_state._is_level(one) for one in relaxing)
-
-
-def test_after_the_last_chunk_noise_is_accepted_and_drift_is_not() -> None:
-    noise = 0.5 * np.random.default_rng(3).normal(size=(500, 40))
-    drifting, relaxing = (
-        noise + np.linspace(0.0, 4.0, 40),
-        noise + 4.0 * np.exp(-np.linspace(0.0, 2.0, 40)),
-    )
-    assert np.mean([steady_state._is_level_noise(one, 0.5) for one in noise]) > 0.99
-    for series in (drifting, relaxing):
-        assert np.mean([steady_state._is_level_noise(one, 0.5) for one in series]) < 0.05
-    assert not steady_state._is_level_noise(np.full(40, np.nan))
-
-
 def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch) -> None:
     rng, sheared = np.random.default_rng(3), []
 
@@ -165,7 +136,7 @@ def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_other
     monkeypatch,
 ) -> None:
     monkeypatch.setattr(steady_state, "RELAXATION_STRAIN", 0.02)
-    monkeypatch.setattr(steady_state, "_SHORTENING_STRAIN", 0.02)
+    monkeypatch.setattr(steady_state, "SHORTENING_STRAIN", 0.02)
     flows = [ShearFlow(32, 0.5, 0.7, dt) for dt in (1e-2, 1e-3)]
     keys = jax.random.split(jax.random.PRNGKey(5), len(flows))
     together = prepare_batch(stack(flows), keys, equilibrate=0.1)

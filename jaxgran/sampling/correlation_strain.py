@@ -21,11 +21,8 @@ from jaxgran.model.checks import is_traced
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import Status
 from jaxgran.sampling.sample import Sample
+from jaxgran.sampling.thresholds import FEWEST_CORRELATION_STRAINS, RELAXATION_STRAIN
 
-RELAXATION_STRAIN = 0.5  # strain in which the contact network adapts to a new time step
-FEWEST_CORRELATION_STRAINS = 4.0  # of a sample; a shorter one gets the status ``short_sample``
-SAMPLE_CORRELATION_STRAINS = 6.0  # of a sample whose strain is not given
-LEAST_SAMPLE = 8.0  # its strain, at least
 _WAVE = 0.35  # correlation strain of the longest waves over γ̇ L √(ρ/p)
 
 

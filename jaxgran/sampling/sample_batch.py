@@ -13,17 +13,15 @@ from jaxtyping import Array
 
 from jaxgran.model.status import GIVEN_UP, Status
 from jaxgran.sampling.blocks import Batch, shear_by_block
-from jaxgran.sampling.correlation_strain import (
-    LEAST_SAMPLE,
-    SAMPLE_CORRELATION_STRAINS,
-    length_status,
-    sampled_correlation_strain,
-)
+from jaxgran.sampling.correlation_strain import length_status, sampled_correlation_strain
 from jaxgran.sampling.observe import AdvanceBatch, advance_batch
 from jaxgran.sampling.sample import BLOCKS, Sample, relative_error
-
-LONGEST_STRAIN = 256.0  # of a sample that is extended until its errors are small
-LONGEST_CORRELATION_STRAINS = 32.0  # the same limit in correlation strains, where it is longer
+from jaxgran.sampling.thresholds import (
+    LEAST_SAMPLE,
+    LONGEST_CORRELATION_STRAINS,
+    LONGEST_STRAIN,
+    SAMPLE_CORRELATION_STRAINS,
+)
 
 
 def sample_batch(

@@ -11,7 +11,8 @@ means of ln T in the two halves must differ by less than twice the standard erro
 difference, or by less than 0.1, and this error must be at most 0.1. The same holds for ln P. In
 this error, chunks are correlated over at least the correlation strain of the flow. Small systems
 fluctuate more, so a flow that is undecided after the last chunk still counts as steady if the means
-differ by less than four standard errors of the noise about a linear trend.
+differ by less than four standard errors of the noise about a linear trend. How often this decides
+rightly is in ``thresholds``.
 
 A chunk lasts a quarter of the correlation strain, which is measured in the first chunks. So the
 preparation takes at least three correlation strains.
@@ -37,36 +38,30 @@ from jaxgran.model.state import State
 from jaxgran.model.status import GIVEN_UP, Status
 from jaxgran.sampling.blocks import Batch, shear_by_block
 from jaxgran.sampling.correlation_strain import (
-    RELAXATION_STRAIN,
     flow_correlation_strain,
     sampled_correlation_strain,
     total_mass,
 )
+from jaxgran.sampling.drift import is_level, is_level_noise
 from jaxgran.sampling.heated import heat_replica, replicas_of_keys, require_uncompiled
 from jaxgran.sampling.observe import AdvanceBatch, advance_batch
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.sample import Sample
 from jaxgran.sampling.sampler import check_precision
+from jaxgran.sampling.thresholds import (
+    FEWEST_CHUNKS,
+    MEASURING_CHUNKS,
+    MOST_CHUNKS,
+    RELAXATION_STRAIN,
+    SHORTENING_STRAIN,
+    SHORTEST_CHUNK,
+)
 from jaxgran.sampling.timestep import (
     bounded_coarse_timestep,
     check_timestep,
     expected_temperature,
     timestep_ladder,
 )
-from jaxgran.statistics import drift
-
-_SHORTENING_STRAIN = 0.1  # strain at each time step between the coarse and the final one
-_SHORTEST_CHUNK = 0.75  # strain of a chunk
-_FEWEST_CHUNKS = 12  # before the first test for a steady state
-LEAST_PREPARATION = _FEWEST_CHUNKS * _SHORTEST_CHUNK  # strain, where it is not given
-_MEASURING_CHUNKS = 4  # which set the length of later chunks; the test leaves them out
-_MOST_CHUNKS = 60  # before the flow counts as not steady
-_LARGEST_STEADY_RATIO = 2.0  # drift over its standard error, below which it is noise
-_LARGEST_STEADY_DRIFT = 0.1  # in ln T and ln P; a smaller drift is accepted
-_LARGEST_STEADY_ERROR = (
-    0.1  # of the drift, in ln T and ln P; above it the test is undecided until the last chunk
-)
-_LARGEST_LAST_RATIO = 4.0  # of the drift over the error of the noise, after the last chunk
 
 
 def prepare(
@@ -196,26 +191,26 @@ def _with_correlation_strain(batch: Batch, sample: Sample) -> Batch:
 
 
 def _until_steady(batch: Batch, advance: AdvanceBatch) -> Batch:
-    """Shear in chunks until every replica is steady, or ``_MOST_CHUNKS`` times; steady replicas are
+    """Shear in chunks until every replica is steady, or ``MOST_CHUNKS`` times; steady replicas are
     not advanced.
     """
     count = len(batch.status)
     steady, record = np.zeros(count, bool), []
-    for chunks in range(1, _MOST_CHUNKS + 1):
+    for chunks in range(1, MOST_CHUNKS + 1):
         waiting = steady | (batch.status >= GIVEN_UP)
         if waiting.all():
             break
-        chunk = np.maximum(_SHORTEST_CHUNK, batch.correlation_strain / 4)
+        chunk = np.maximum(SHORTEST_CHUNK, batch.correlation_strain / 4)
         correlation = np.exp(-2 * chunk / batch.correlation_strain)
         strain = np.where(waiting, 0, chunk)
         batch, sample = shear_by_block(batch, strain, 1, advance)
         batch, means = batch._replace(strain=batch.strain + strain), sample.averages
-        if chunks <= _MEASURING_CHUNKS:
+        if chunks <= MEASURING_CHUNKS:
             batch = _with_correlation_strain(batch, sample)
         record.append(np.log(np.stack([means["granular_temperature"], means["pressure"]])))
-        if chunks >= _FEWEST_CHUNKS:
+        if chunks >= FEWEST_CHUNKS:
             late = np.stack(record[chunks // 3 :])
-            judge = _is_level if chunks < _MOST_CHUNKS else _is_level_noise
+            judge = is_level if chunks < MOST_CHUNKS else is_level_noise
             level = [
                 steady[k] or all(judge(late[:, q, k], correlation[k]) for q in (0, 1))
                 for k in range(count)
@@ -238,29 +233,7 @@ def _shortened(batch: Batch, flow: ShearFlow, advance: AdvanceBatch) -> Batch:
         active = np.isfinite(timesteps)
         current = np.where(active, timesteps, final).astype(batch.state.side.dtype)
         batch = batch._replace(flow=replace(flow, timestep=current))
-        batch = _sheared(batch, np.where(active, _SHORTENING_STRAIN, 0.0), advance)
+        batch = _sheared(batch, np.where(active, SHORTENING_STRAIN, 0.0), advance)
     batch = batch._replace(flow=flow)
     relaxation = np.where(coarse > final, RELAXATION_STRAIN, 0.0)
     return _sheared(batch, relaxation, advance) if relaxation.any() else batch
-
-
-def _is_level(series: np.ndarray, least_correlation: float = 0.0) -> bool:
-    """Whether the means of the two halves of a series agree, and the error of their difference is
-    small.
-    """
-    difference, error = drift(series, least_correlation)
-    return bool(
-        error <= _LARGEST_STEADY_ERROR
-        and abs(difference) <= max(_LARGEST_STEADY_RATIO * error, _LARGEST_STEADY_DRIFT)
-    )
-
-
-def _is_level_noise(series: np.ndarray, least_correlation: float = 0.0) -> bool:
-    """Whether the means of the two halves of a long series agree within its noise, which may be
-    large.
-    """
-    place = np.arange(len(series)) - (len(series) - 1) / 2
-    slope = np.sum(place * series) / np.sum(place**2)
-    difference, _ = drift(series)
-    _, error = drift(series - slope * place, least_correlation)
-    return bool(abs(difference) <= max(_LARGEST_LAST_RATIO * error, _LARGEST_STEADY_DRIFT))
