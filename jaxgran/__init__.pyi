@@ -36,10 +36,11 @@ from .plotting.size import averages_against_grains
 from .plotting.theory import cluster_shares, theory_errors
 from .reference.law import constitutive_law
 from .reference.validity import validity
+from .sampling.heated import heated
 from .sampling.packing import pack
 from .sampling.sample import Sample
 from .sampling.sampler import sample
-from .sampling.steady_state import heated, prepare
+from .sampling.steady_state import prepare
 
 __version__: str
 __all__ = [

@@ -47,7 +47,7 @@ from jaxgran.model.status import Status
 from jaxgran.plotting import theory
 from jaxgran.plotting.map_figures import FIGURES
 from jaxgran.plotting.movie import check_movie
-from jaxgran.sampling import sampler, steady_state
+from jaxgran.sampling import heated, sampler, steady_state
 from jaxgran.sampling.observe import observed_shapes
 
 GRAINS = 32
@@ -78,7 +78,7 @@ def nothing_runs() -> Iterator[None]:
             (snapshots, "_snapshot_series"),
             (fields, "_fields_at"),
             (steady_state, "prepare_batch"),
-            (steady_state, "_heated"),
+            (heated, "heat_replica"),
             (ratio_map_module, "run_replicas"),
         ):
             patch.setattr(module, name, would_run)

@@ -47,8 +47,8 @@ from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
 from jaxgran.plotting.map_figures import FIGURES
 from jaxgran.sampling.budget import sampling_error
-from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
 from jaxgran.sampling.observables import OBSERVABLES
+from jaxgran.sampling.thresholds import LEAST_SAMPLE
 
 SMALL_MAP = (
     "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 32 --seeds 1 --timestep 1e-3 "

@@ -9,8 +9,9 @@ import pytest
 from synthetic import random_tally
 from test_statistics import ar1
 
-from jaxgran.sampling.correlation_strain import RELAXATION_STRAIN, flow_correlation_strain
+from jaxgran.sampling.correlation_strain import flow_correlation_strain
 from jaxgran.sampling.sample import Sample, correlation_strains
+from jaxgran.sampling.thresholds import RELAXATION_STRAIN
 
 
 def correlation_strain(

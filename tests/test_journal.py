@@ -19,7 +19,8 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.sampling.observe import advance_batch
-from jaxgran.sampling.steady_state import prepare_batch, sample_batch
+from jaxgran.sampling.sample_batch import sample_batch
+from jaxgran.sampling.steady_state import prepare_batch
 
 KEYS = [(0, 0), (1, 0)]
 GRAINS = (

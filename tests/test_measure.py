@@ -20,11 +20,14 @@ from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State, require_match
 from jaxgran.model.status import DEEP_SHARE, Status
+from jaxgran.sampling import sample as sample_module
+from jaxgran.sampling.averages import averages
+from jaxgran.sampling.blocks import Batch
 from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.observe import advance_batch
 from jaxgran.sampling.sample import BLOCKS, Sample
 from jaxgran.sampling.sampler import _sample, check_precision, sample
-from jaxgran.sampling.steady_state import Batch, prepare_batch
+from jaxgran.sampling.steady_state import prepare_batch
 
 GRAINS, TIMESTEP, STRAIN = 64, 1e-2, 0.64
 FLOWS = [ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0.5, 0.9)]
@@ -100,13 +103,32 @@ def test_averages_are_those_of_all_blocks_together() -> None:
 
 def test_deep_overlaps_are_judged_by_their_share_of_all_contacts_of_a_sample() -> None:
     tally = random_tally(np.random.default_rng(1), BLOCKS)
-    one = Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS)
+
+    def status() -> int:
+        return int(Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS).status)
+
     tally.deep_contacts[0] = 0.99 * DEEP_SHARE * tally.contacts.sum()  # all in one block
-    assert one.status == Status.ok
+    assert status() == Status.ok
     tally.deep_contacts[0] *= 1.03
-    assert one.status == Status.deep_overlap
+    assert status() == Status.deep_overlap
     tally.status[3] = Status.capacity
-    assert one.status == Status.capacity
+    assert status() == Status.capacity
+
+
+def test_averages_and_errors_are_computed_once_and_cannot_be_written_to(monkeypatch) -> None:
+    calls = []
+    monkeypatch.setattr(
+        sample_module, "averages", lambda *x, **y: (calls.append(1), averages(*x, **y))[1]
+    )
+    tally = random_tally(np.random.default_rng(2), BLOCKS)
+    one = Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS)
+    once = (one.pressure, one.contact_stress, one.errors()["pressure"], len(calls))
+    again = (one.pressure, one.contact_stress, one.errors()["pressure"], len(calls))
+    assert all(map(np.array_equal, once, again))
+    one.averages["pressure"] = one.errors()["pressure"] = 0.0  # of a copy
+    assert one.pressure == once[0] and one.errors()["pressure"] == once[2]
+    with pytest.raises(ValueError, match="read-only"):
+        one.contact_stress[0, 0] = 0.0
 
 
 def test_errors_of_a_batch_are_those_of_each_replica_which_an_index_takes() -> None:

@@ -173,7 +173,7 @@ def test_callback_is_told_of_every_block_and_may_end_the_sample(flowing) -> None
 
 
 def test_callback_is_refused_under_a_transformation(flowing) -> None:
-    with pytest.raises(InputError, match="callback must be None for a batch, and where"):
+    with pytest.raises(InputError, match="callback must be None where"):
         jax.jit(lambda state: sample(FLOW, state, STRAIN, callback=print))(flowing(0.7))
 
 

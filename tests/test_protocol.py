@@ -19,11 +19,15 @@ from jaxgran.dynamics.engine import Numerics
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
+from jaxgran.sampling import sample_batch as extension
 from jaxgran.sampling import steady_state, timestep
+from jaxgran.sampling.blocks import Batch
+from jaxgran.sampling.heated import heat_replica, replicas_of_keys
 from jaxgran.sampling.observe import advance_batch, reporting
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.sample import relative_error
-from jaxgran.sampling.steady_state import Batch, prepare, prepare_batch, sample_batch
+from jaxgran.sampling.sample_batch import sample_batch
+from jaxgran.sampling.steady_state import prepare, prepare_batch
 from jaxgran.sampling.timestep import check_timestep
 
 GRAINS, TIMESTEP = 32, 1e-2  # with keys that are numbers, as in a map: compiled once
@@ -54,7 +58,7 @@ def test_same_key_gives_the_same_state_and_another_key_another(batch, keys) -> N
 
 def test_start_has_the_temperature_asked_for_and_no_momentum(keys) -> None:
     temperature = jnp.asarray([0.3, 2.0])
-    state, found = run_batch(steady_state._heated, (stack(FLOWS), keys, temperature, None))
+    state, found = run_batch(heat_replica, (stack(FLOWS), keys, temperature, None))
     masses, velocities = np.asarray(state.grains.masses), np.asarray(state.velocities)
     assert np.all(found)
     np.testing.assert_allclose(np.sum(masses[..., None] * velocities, axis=1), 0, atol=1e-12)
@@ -63,55 +67,21 @@ def test_start_has_the_temperature_asked_for_and_no_momentum(keys) -> None:
     assert np.all(state.tilt == 0)
 
 
-def test_steady_noise_is_accepted_at_the_rate_of_its_criterion() -> None:
-    # Two errors hold 95.4 % of a Gaussian, and fewer where the error itself comes from few values.
-    rng = np.random.default_rng(0)
-    for length, least in ((6, 0.85), (40, 0.93)):
-        levels = [steady_state._is_level(0.05 * rng.normal(size=length)) for _ in range(2000)]
-        assert np.mean(levels) > least - 4 * np.sqrt(least * (1 - least) / 2000)
-
-
-def test_a_drifting_record_is_refused() -> None:
-    rng = np.random.default_rng(1)
-    for length in (6, 20, 40):
-        drifting = np.linspace(0.0, 1.0, length) + 0.05 * rng.normal(size=(200, length))
-        relaxing = np.exp(-np.linspace(0.0, 2.0, length)) + 0.01 * rng.normal(size=(200, length))
-        assert not any(steady_state._is_level(one) for one in drifting)
-        assert not any(steady_state._is_level(one) for one in relaxing)
-
-
-def test_after_the_last_chunk_noise_is_accepted_and_drift_is_not() -> None:
-    noise = 0.5 * np.random.default_rng(3).normal(size=(500, 40))
-    drifting, relaxing = (
-        noise + np.linspace(0.0, 4.0, 40),
-        noise + 4.0 * np.exp(-np.linspace(0.0, 2.0, 40)),
-    )
-    assert np.mean([steady_state._is_level_noise(one, 0.5) for one in noise]) > 0.99
-    for series in (drifting, relaxing):
-        assert np.mean([steady_state._is_level_noise(one, 0.5) for one in series]) < 0.05
-    assert not steady_state._is_level_noise(np.full(40, np.nan))
-
-
 def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch) -> None:
     rng, sheared = np.random.default_rng(3), []
 
-    def chunk(batch: Batch, strain: np.ndarray, advance):
+    def shear(batch: Batch, strain: np.ndarray, *_):
         sheared.append(strain)
-        return batch, None
-
-    def averages(*_):
         n = len(sheared)
         temperature = np.exp(
             [0.02 * rng.normal(), n / 10, rng.normal(), 0.02 * rng.normal(), np.nan]
         )
         pressure = np.exp([0.02 * rng.normal(), 0.0, rng.normal(), -n / 10, np.nan])
-        return {"granular_temperature": temperature, "pressure": pressure}
+        averages = {"granular_temperature": temperature, "pressure": pressure}
+        return batch, SimpleNamespace(averages=averages)
 
-    monkeypatch.setattr(steady_state, "_chunk", chunk)
-    monkeypatch.setattr(steady_state, "_averages", averages)
-    monkeypatch.setattr(
-        steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain
-    )
+    monkeypatch.setattr(steady_state, "shear_by_block", shear)
+    monkeypatch.setattr(steady_state, "_with_correlation_strain", lambda batch, _: batch)
     start: Any = SimpleNamespace(side=np.full(5, 10.0))
     status = np.array([0, 0, 0, 0, Status.nonfinite])
     flow = stack([FLOWS[0]] * 5)
@@ -166,7 +136,7 @@ def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_other
     monkeypatch,
 ) -> None:
     monkeypatch.setattr(steady_state, "RELAXATION_STRAIN", 0.02)
-    monkeypatch.setattr(steady_state, "_SHORTENING_STRAIN", 0.02)
+    monkeypatch.setattr(steady_state, "SHORTENING_STRAIN", 0.02)
     flows = [ShearFlow(32, 0.5, 0.7, dt) for dt in (1e-2, 1e-3)]
     keys = jax.random.split(jax.random.PRNGKey(5), len(flows))
     together = prepare_batch(stack(flows), keys, equilibrate=0.1)
@@ -179,17 +149,15 @@ def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_other
 def test_flow_is_steady_by_the_last_two_thirds_of_its_record(monkeypatch) -> None:
     """A jump before the sixth chunk is out of them after fifteen chunks; twelve are the fewest."""
     series = iter([5.0] * 5 + [0.001, -0.001] * 30)
-    monkeypatch.setattr(steady_state, "_chunk", lambda batch, *_: (batch, None))
-    monkeypatch.setattr(
-        steady_state,
-        "_averages",
-        lambda *_: dict.fromkeys(("granular_temperature", "pressure"), np.exp([next(series)])),
-    )
+
+    def shear(batch: Batch, *_):
+        value = np.exp([next(series)])
+        return batch, SimpleNamespace(averages={"granular_temperature": value, "pressure": value})
+
+    monkeypatch.setattr(steady_state, "shear_by_block", shear)
+    monkeypatch.setattr(steady_state, "_with_correlation_strain", lambda batch, _: batch)
     flow = stack([ShearFlow(32, 0.5, 0.6, 1e-3)])
     state: Any = SimpleNamespace(side=np.array([6.0]))
-    monkeypatch.setattr(
-        steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain
-    )
     end = steady_state._until_steady(
         Batch(flow, Numerics(), state, np.zeros(1, int), np.zeros(1), np.array([4.0])), None
     )
@@ -233,9 +201,9 @@ def test_prepare_of_many_keys_gives_the_state_of_each(batch, keys) -> None:
     assert_same_bits(states, jax.tree.map(jnp.asarray, batch.state))
     assert_same_bits(states[1], prepare(FLOWS[1], keys[1], equilibrate=0.5))
     grains = states.grains
-    given = steady_state._replicas("prepare", flows, keys, jax.tree.map(lambda x: x[0], grains))[2]
+    given = replicas_of_keys(flows, keys, jax.tree.map(lambda x: x[0], grains))[2]
     np.testing.assert_array_equal(given.radii, jnp.stack([grains.radii[0]] * 2))
-    assert_same_bits(steady_state._replicas("prepare", flows, keys, grains)[2], grains)
+    assert_same_bits(replicas_of_keys(flows, keys, grains)[2], grains)
 
 
 def test_prepare_names_the_replicas_that_failed(batch, keys, monkeypatch) -> None:
@@ -279,8 +247,8 @@ def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(
     """Both replicas start with a strain of 0.64, in 32 blocks of two steps; the limit is four times
     that.
     """
-    monkeypatch.setattr(steady_state, "LONGEST_STRAIN", 2.56)
-    monkeypatch.setattr(steady_state, "LONGEST_CORRELATION_STRAINS", 0)
+    monkeypatch.setattr(extension, "LONGEST_STRAIN", 2.56)
+    monkeypatch.setattr(extension, "LONGEST_CORRELATION_STRAINS", 0)
     _, short = sample_batch(batch, 0.64)
     errors = [relative_error(replica(short, k)) for k in (0, 1)]
     target = np.mean(errors) if abs(np.subtract(*errors)) > 1e-3 else min(errors) * 0.9
@@ -296,8 +264,8 @@ def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(
 
 
 def test_sample_that_has_grown_is_the_sample_of_its_strain(batch, monkeypatch) -> None:
-    monkeypatch.setattr(steady_state, "LONGEST_STRAIN", 0.64)
-    monkeypatch.setattr(steady_state, "LONGEST_CORRELATION_STRAINS", 0)
+    monkeypatch.setattr(extension, "LONGEST_STRAIN", 0.64)
+    monkeypatch.setattr(extension, "LONGEST_CORRELATION_STRAINS", 0)
     _, grown = sample_batch(batch, 0.32, error=1e-9)
     _, whole = sample_batch(batch, 0.64)
     np.testing.assert_allclose(grown.tally.steps, whole.tally.steps)
@@ -314,9 +282,9 @@ def test_report_is_told_every_replica_step(batch) -> None:
 
 
 def test_a_sample_lasts_six_memories_and_one_of_less_than_four_says_so(batch, monkeypatch) -> None:
-    monkeypatch.setattr(steady_state, "LEAST_SAMPLE", 0.5)
+    monkeypatch.setattr(extension, "LEAST_SAMPLE", 0.5)
     monkeypatch.setattr(
-        steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain
+        extension, "sampled_correlation_strain", lambda *_: ready.correlation_strain
     )
     ready = batch._replace(status=np.zeros(2, int), correlation_strain=np.array([0.2, 0.4]))
     _, long = sample_batch(ready, None)
@@ -331,11 +299,11 @@ def test_a_sample_lasts_six_memories_and_one_of_less_than_four_says_so(batch, mo
 def test_a_sample_for_an_error_is_at_least_twice_as_long_and_its_longest_strain_says_so(
     batch, monkeypatch
 ) -> None:
-    monkeypatch.setattr(steady_state, "LEAST_SAMPLE", 0.32)
-    monkeypatch.setattr(steady_state, "LONGEST_STRAIN", 0.64)
-    monkeypatch.setattr(steady_state, "LONGEST_CORRELATION_STRAINS", 0)
+    monkeypatch.setattr(extension, "LEAST_SAMPLE", 0.32)
+    monkeypatch.setattr(extension, "LONGEST_STRAIN", 0.64)
+    monkeypatch.setattr(extension, "LONGEST_CORRELATION_STRAINS", 0)
     monkeypatch.setattr(
-        steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain
+        extension, "sampled_correlation_strain", lambda *_: ready.correlation_strain
     )
     ready = batch._replace(status=np.zeros(2, int), correlation_strain=np.full(2, 0.01))
     for error, status in ((1e9, Status.ok), (1e-9, Status.strain_limit)):

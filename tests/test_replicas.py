@@ -102,15 +102,29 @@ def test_replicas_advance_together_on_an_accelerator_only(
     np.testing.assert_array_equal(found, ALPHAS * float(platform == "accelerator"))
 
 
-def test_batches_of_any_size_are_compiled_once(states: State, monkeypatch) -> None:
-    traced = []
-    original = sampler._sample_blocks
-    monkeypatch.setattr(sampler, "_sample_blocks", lambda *x: (traced.append(x), original(*x))[1])
+def test_batches_of_any_size_are_compiled_once(states: State) -> None:
+    jg.sample(FLOWS[:2], states[:2], 0.1, blocks=3)
+    compiled = sampler._sample._cache_size()
     for count in (5, 1, 8):
         many = np.arange(count) % 3
         _, found = jg.sample(FLOWS[many], states[many], 0.1, blocks=3)
         assert found.tally.steps.shape == (count, 3)
-    assert len(traced) == 1
+    assert sampler._sample._cache_size() == compiled
+
+
+def test_callback_of_a_batch_is_told_of_all_replicas_which_are_those_of_their_own_calls(
+    states: State,
+) -> None:
+    lengths = []
+
+    def callback(state: State, so_far: jg.Sample) -> None:
+        lengths.append((len(state), *so_far.tally.steps.shape))
+
+    ends, together = sample(FLOWS, states, 0.1, blocks=2, callback=callback)
+    assert lengths == [(3, 3, 1), (3, 3, 2)]
+    for k in range(3):
+        alone = sample(FLOWS[k], states[k], 0.1, blocks=2, callback=lambda *_: None)
+        assert_same((ends[k], together[k]), alone)
 
 
 MISTAKES = {
@@ -131,10 +145,6 @@ MISTAKES = {
     "a strain below zero": (
         lambda s: sample(FLOWS, s, np.array([0.1, 0.1, -1])),
         "a positive number",
-    ),
-    "a callback": (
-        lambda s: sample(FLOWS, s, 0.1, callback=print),
-        "callback must be None for a batch",
     ),
     "steps below zero": (
         lambda s: jg.advance(FLOWS, s, np.array([1, 2, -1])),

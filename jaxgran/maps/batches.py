@@ -14,8 +14,7 @@ from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.replica import Key
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.flow import ShearFlow
-from jaxgran.sampling.correlation_strain import LEAST_SAMPLE, RELAXATION_STRAIN
-from jaxgran.sampling.steady_state import LEAST_PREPARATION
+from jaxgran.sampling.thresholds import LEAST_PREPARATION, LEAST_SAMPLE, RELAXATION_STRAIN
 from jaxgran.sampling.timestep import COARSE_TIMESTEP
 
 _PAIR_BYTES = 48  # of memory for each pair of grains, in a search that compares all pairs

@@ -26,7 +26,8 @@ from jaxgran.maps.replica import Advance, Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.observe import AdvanceWrapper, ObserveBatch, advance_batch, reporting
-from jaxgran.sampling.steady_state import prepare_batch, sample_batch
+from jaxgran.sampling.sample_batch import sample_batch
+from jaxgran.sampling.steady_state import prepare_batch
 
 
 def run_replicas(

@@ -27,9 +27,9 @@ from jaxgran.model.checks import (
 from jaxgran.model.choices import MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import own_grains
-from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
 from jaxgran.sampling.packing import require_room
 from jaxgran.sampling.prediction import predicted
+from jaxgran.sampling.thresholds import LEAST_SAMPLE
 from jaxgran.sampling.timestep import expected_temperature, longest_timestep
 
 FEWEST_STEPS = 160  # of a sample: five time steps in each of its 32 blocks

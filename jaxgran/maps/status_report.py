@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxgran.maps.schema import MapData, flattened, parts
 from jaxgran.model.status import MEANINGS
-from jaxgran.sampling.correlation_strain import FEWEST_CORRELATION_STRAINS
+from jaxgran.sampling.thresholds import FEWEST_CORRELATION_STRAINS
 
 _MOST_NAMED = 6  # points of a map in one sentence
 

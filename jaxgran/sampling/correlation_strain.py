@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxgran.model.checks import is_traced
+from jaxgran.model.grains import Grains
 from jaxgran.model.status import Status
+from jaxgran.sampling.sample import Sample
+from jaxgran.sampling.thresholds import FEWEST_CORRELATION_STRAINS, RELAXATION_STRAIN
 
-RELAXATION_STRAIN = 0.5  # strain in which the contact network adapts to a new time step
-FEWEST_CORRELATION_STRAINS = 4.0  # of a sample; a shorter one gets the status ``short_sample``
-SAMPLE_CORRELATION_STRAINS = 6.0  # of a sample whose strain is not given
-LEAST_SAMPLE = 8.0  # its strain, at least
 _WAVE = 0.35  # correlation strain of the longest waves over γ̇ L √(ρ/p)
 
 
@@ -59,6 +59,21 @@ def flow_correlation_strain(
     return xp.maximum(
         RELAXATION_STRAIN, xp.fmax(*(xp.where(xp.isfinite(x), x, 0.0) for x in (heating, waves)))
     )
+
+
+def sampled_correlation_strain(sample: Sample, grains: Grains) -> Any:
+    """``flow_correlation_strain`` at the averages of a sample, or of each of a batch."""
+    return flow_correlation_strain(
+        sample.averages, sample.grains, total_mass(grains), sample.area, sample.shear_rate
+    )
+
+
+def total_mass(grains: Grains) -> Any:
+    """Mass of all grains, or of those of each replica, in m."""
+    if is_traced(grains.masses):
+        return jnp.sum(grains.masses, axis=-1)
+    # contiguous, or the order of the sum would depend on the place in a batch
+    return np.sum(np.ascontiguousarray(grains.masses), axis=-1)
 
 
 def length_status(strain: Any, correlation_strain: Any) -> Any:

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import numpy as np
@@ -14,10 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.dynamics.tally import TABLE, Tally
 from jaxgran.model.batches import Indexable, equal_values, in_numpy
-from jaxgran.model.checks import (
-    InputError,
-    require_untraced,
-)
+from jaxgran.model.checks import InputError, is_traced, require_untraced
 from jaxgran.model.display import are_numbers, rounded, text_of
 from jaxgran.model.status import Status
 from jaxgran.sampling.averages import averages
@@ -32,6 +29,7 @@ from jaxgran.statistics import (
 if TYPE_CHECKING:
     import xarray as xr
 
+T = TypeVar("T")
 BLOCKS = 32
 ERROR_OBSERVABLES = (
     "force_ratio",
@@ -43,6 +41,26 @@ _SHOWN = (
     *("force_ratio", "pressure", "shear_stress", "granular_temperature"),
     *("coordination_number", "macroscopic_friction", "inertial_number"),
 )
+
+
+def _computed_once(compute: Callable[["Sample"], T]) -> T:
+    """A property that is computed at its first use, and again where JAX traces the sample, since a
+    traced value must not outlive its trace. Arrays that are kept cannot be written to.
+    """
+    name = f"{compute.__name__}_value"
+
+    def value(sample: "Sample") -> T:
+        if is_traced(sample):
+            return compute(sample)
+        if name not in vars(sample):
+            result = compute(sample)
+            for leaf in jax.tree.leaves(result):
+                if isinstance(leaf, np.ndarray):
+                    leaf.flags.writeable = False
+            vars(sample)[name] = result
+        return vars(sample)[name]
+
+    return property(value)  # type: ignore[return-value]
 
 
 @jax.tree_util.register_dataclass
@@ -80,8 +98,7 @@ class Sample(Averages, Indexable):
             or np.ndim(self.tally.contact_moment) < 3
         ):
             return text_of("Sample", {"grains": self.grains, "area": self.area})
-        sample = in_numpy(self)
-        single, averages, status = not self._axes, sample.averages, np.asarray(sample.status)
+        single, averages, status = not self._axes, self.averages, np.asarray(self.status)
         counts = Counter(Status(int(code)).name for code in status.flat).most_common()
         names = (name if single else f"{name} ({count})" for name, count in counts)
         return text_of(
@@ -89,11 +106,11 @@ class Sample(Averages, Indexable):
             {
                 **({} if single else {"replicas": status.size}),
                 "grains": self.grains,
-                "strain": rounded(sample.strain),
+                "strain": rounded(self.strain),
                 **{name: averages[name] for name in _SHOWN},
                 "status": ", ".join(names),
             },
-            sample.errors() if single else None,
+            self.errors() if single else None,
         )
 
     @property
@@ -103,7 +120,7 @@ class Sample(Averages, Indexable):
     @property
     def averages(self) -> Mapping[str, Array | np.ndarray]:
         """All observables over all blocks, by name."""
-        return averages(self._total, self.area, self.grains, self.shear_rate)
+        return dict(self._averages)
 
     @property
     def strain(self) -> Float[Array | np.ndarray, "*replicas"]:
@@ -124,24 +141,31 @@ class Sample(Averages, Indexable):
         """
         return self.tally.observed
 
-    @property
-    def _total(self) -> Tally:
-        return in_numpy(self.tally).total(axis=np.ndim(self.area))
-
     def errors(self) -> dict[str, np.ndarray]:
-        """Standard errors of the averages by the names of the observables, see ``standard_errors``.
-
-        Those of a batch are of each replica by itself, with its axes.
+        """Standard errors of the averages by the names of the observables, see ``standard_errors``;
+        those of a batch are of each replica.
 
         Raises:
           InputError: JAX transforms this function.
         """
         require_untraced("errors()", "take it of the finished sample", self)
-        here = in_numpy(self)
-        if not np.ndim(here.area):
-            return estimates([here])[1]
-        each = [here[place].errors() for place in range(len(here.area))]
-        return {name: np.stack([errors[name] for errors in each]) for name in each[0]}
+        return dict(self._errors)
+
+    @_computed_once
+    def _total(self) -> Tally:
+        return in_numpy(self.tally).total(axis=np.ndim(self.area))
+
+    @_computed_once
+    def _averages(self) -> Mapping[str, Array | np.ndarray]:
+        return averages(self._total, self.area, self.grains, self.shear_rate)
+
+    @_computed_once
+    def _errors(self) -> dict[str, np.ndarray]:
+        sample = in_numpy(self)
+        if not self._axes:
+            return estimates([sample])[1]
+        of_replicas = [replica.errors() for replica in sample]
+        return {name: np.stack([errors[name] for errors in of_replicas]) for name in of_replicas[0]}
 
     def to_dataset(self) -> "xr.Dataset":
         """The averages as an ``xarray.Dataset``, named as in a map: NAME, NAME_stderr, and the

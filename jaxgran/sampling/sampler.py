@@ -1,6 +1,6 @@
 """Shears flows, one or a batch, and samples them in blocks of strain."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -9,14 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.advance import advance_blocks
-from jaxgran.dynamics.batch import checked_batch, shear_batch
+from jaxgran.dynamics.batch import Arguments, checked_batch, shear_batch
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.tally import Tally
+from jaxgran.environment import usable_threads
 from jaxgran.model.checks import (
     InputError,
     as_array,
@@ -28,9 +29,9 @@ from jaxgran.model.checks import (
 )
 from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
 from jaxgran.model.state import State, require_match, require_state
-from jaxgran.sampling.averages import averages
-from jaxgran.sampling.correlation_strain import flow_correlation_strain, length_status
-from jaxgran.sampling.observe import Observable, advance_and_observe
+from jaxgran.sampling.blocks import advance_by_block, sample_of_blocks
+from jaxgran.sampling.correlation_strain import length_status, sampled_correlation_strain
+from jaxgran.sampling.observe import Observable, advance_and_observe, advance_batch
 from jaxgran.sampling.sample import BLOCKS, Sample
 
 MOST_BLOCKS = 10**6
@@ -80,9 +81,8 @@ def sample(
         20 s. The next process loads the program. The contacts are those of a step with an
         approaching contact, before the impulses act; other steps have none. The size of their
         buffers varies, so ``observe`` must return sums over contacts or over grains.
-      callback: called after each block with the state and the sample so far; if its result is true,
-        the sample ends. One block is then compiled at a time, and neither batches nor JAX
-        transformations apply.
+      callback: called after each block with the state and the sample so far, or those of the
+        batch; if its result is true, the sample ends. JAX transformations do not apply then.
       solver: solves the contacts of each step, by default ``BarzilaiBorwein()``. New numbers in it
         do not recompile.
       engine: ``Jax()`` or ``Numba()``; None for the fastest that can do this, see ``advance``.
@@ -116,7 +116,8 @@ def sample(
     require_whole("blocks", blocks, 1, MOST_BLOCKS, "as a tally is kept for each")
     strain = as_array(strain)
     require("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
-    batch = checked_batch(partial(_require_sheared_state, blocks), flow, state, strain)
+    check = partial(_require_sheared_state, blocks)
+    batch = checked_batch(check, flow, state, strain)
     numerics = checked_numerics(solver, engine)
     for name, function in (("observe", observe), ("callback", callback)):
         if function is not None and not callable(function):
@@ -126,13 +127,13 @@ def sample(
             return waited(_sample(flow, state, strain, numerics, blocks, observe))
         option = "" if observe is None else "observe"
         return shear_batch(_sample, numerics, batch, (blocks, observe), option)
-    if batch or is_traced(flow, numerics, state, strain):
-        raise InputError(
-            "callback must be None for a batch, and where a sample is transformed, as by jax.jit."
-        )
-    return _sample_with_callback(
-        flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe, callback
+    if is_traced(flow, numerics, state, strain):
+        raise InputError("callback must be None where a sample is transformed, as by jax.jit.")
+    replicas = batch or checked_batch(
+        check, flow, jax.tree.map(lambda x: jnp.asarray(x)[None], state), strain
     )
+    assert replicas is not None
+    return _sample_with_callback(replicas, batch is None, numerics, blocks, observe, callback)
 
 
 def _require_sheared_state(blocks: int, flow: ShearFlow, state: State, strain: Any) -> None:
@@ -152,80 +153,57 @@ def _sample(
     blocks: int,
     observe: Observable | None = None,
 ) -> tuple[State, Sample]:
-    end, measured = _sample_blocks(
-        flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe
-    )
-    return end, _with_length(measured, end)
-
-
-def _steps_of_blocks(flow: ShearFlow, strain: float | Array, blocks: int) -> Int[Array, " blocks"]:
-    return steps_of_blocks(steps_of_strain(flow, strain), blocks)
-
-
-def _sample_blocks(
-    flow: ShearFlow,
-    numerics: Numerics,
-    state: State,
-    steps: Int[Array, " blocks"],
-    observe: Observable | None,
-) -> tuple[State, Sample]:
-    """The final state and the sample of blocks with the given numbers of time steps."""
-
-    def block(state: State, steps: Array) -> tuple[State, Tally]:
-        return advance_and_observe(flow, state, steps, numerics, observe)
-
+    """The sample of one replica, in one compiled program."""
+    steps = steps_of_blocks(steps_of_strain(flow, strain), blocks)
     if observe is None:
         state, tally = advance_blocks(flow, numerics, state, steps)
     else:
-        state, tally = lax.scan(block, state, steps)
+        state, tally = lax.scan(
+            lambda state, steps: advance_and_observe(flow, state, steps, numerics, observe),
+            state,
+            steps,
+        )
     shear_rate = jnp.asarray(flow.shear_rate, state.side.dtype)
-    return state, Sample(tally, state.side**2, shear_rate, flow.grains)
-
-
-_sample_one_block = jax.jit(_sample_blocks, static_argnames="observe")
+    return state, _with_length(Sample(tally, state.side**2, shear_rate, flow.grains), state)
 
 
 def _sample_with_callback(
-    flow: ShearFlow,
+    batch: Arguments,
+    single: bool,
     numerics: Numerics,
-    state: State,
-    steps_of_blocks: Int[Array, " blocks"],
+    blocks: int,
     observe: Observable | None,
-    callback: Callable,
+    callback: Callable[[State, Sample], Any],
 ) -> tuple[State, Sample]:
-    """The sample, block by block, with a call of ``callback`` after each."""
-    parts: list[Sample] = []
-    for steps in np.asarray(steps_of_blocks):
-        measured = _sample_one_block(flow, numerics, state, jnp.asarray([steps]), observe)
-        state, part = waited(measured)
-        parts.append(part)
-        if callback(state, _with_length(_joined(parts), state)):
-            break
-    return state, _with_length(_joined(parts), state)
+    """The sample of a batch, or of a batch of a single replica, block by block."""
+    flow, start, strain = batch
+
+    def result(end: State, tallies: Sequence[Tally]) -> tuple[State, Sample]:
+        measured = _with_length(sample_of_blocks(flow, end, tallies), end)
+        return jax.tree.map(lambda x: jnp.asarray(x[0] if single else x), (end, measured))
+
+    advance = partial(advance_batch, observe=observe, threads=usable_threads())
+    return result(
+        *advance_by_block(
+            advance,
+            (flow, numerics, start),
+            strain,
+            blocks,
+            np.zeros(np.shape(start.side), bool),
+            stop=lambda *so_far: callback(*result(*so_far)),
+        )
+    )
 
 
 def _with_length(measured: Sample, state: State) -> Sample:
     """The sample with the status ``short_sample`` in its last block where it is short, see
     ``correlation_strain``.
     """
-    tally, grains = measured.tally, measured.grains
-    total = averages(tally.total(axis=0), measured.area, grains, measured.shear_rate)
-    mass = jnp.sum(state.grains.masses)
-    correlation = flow_correlation_strain(total, grains, mass, measured.area, measured.shear_rate)
-    status = length_status(jnp.sum(tally.duration) * measured.shear_rate, correlation)
-    last = jnp.maximum(tally.status[-1], jnp.asarray(status, tally.status.dtype))
-    return replace(
-        measured, tally=replace(tally, status=jnp.asarray(tally.status).at[-1].set(last))
-    )
-
-
-def _joined(parts: list[Sample]) -> Sample:
-    """One sample from successive samples of the same flow."""
-    tallies = (part.tally for part in parts)
-    tally = jax.tree.map(
-        lambda *x: jnp.asarray(np.concatenate([np.asarray(one) for one in x])), *tallies
-    )
-    return replace(parts[-1], tally=tally)
+    correlation_strain = sampled_correlation_strain(measured, state.grains)
+    of_length = length_status(measured.strain, correlation_strain)
+    status = jnp.asarray(measured.tally.status)
+    worst = jnp.maximum(status[..., -1], jnp.asarray(of_length, status.dtype))
+    return replace(measured, tally=replace(measured.tally, status=status.at[..., -1].set(worst)))
 
 
 def check_precision(flow: ShearFlow, state: State) -> None:
