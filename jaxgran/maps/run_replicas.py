@@ -1,7 +1,8 @@
 """Runs the replicas of a map, in batches: in threads of this process, or on a cluster.
 
-The random numbers of a replica depend on its seed and its point only. So results do not depend on
-the batches, their order or the number of workers.
+The random numbers of a replica depend on its flow and its seed only, see ``random_key``. So its
+results do not depend on the other points of the map, on the batches, their order or the number of
+workers.
 """
 
 import math
@@ -22,7 +23,7 @@ from jaxgran.maps.batches import remaining_batches
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import Provenance, run_on_cluster
 from jaxgran.maps.journal import Journal
-from jaxgran.maps.replica import Advance, Key, Replica
+from jaxgran.maps.replica import Advance, Key, Replica, ReplicaId, replica_ids
 from jaxgran.maps.settings import MapSettings
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.observe import AdvanceWrapper, ObserveBatch, advance_batch, reporting
@@ -139,10 +140,16 @@ def _reporting(task: Sequence[Key], report: Callable[[Advance], None] | None) ->
     return reporting(advance_batch, lambda timestep, steps: report(Advance(task, timestep, steps)))
 
 
+def random_key(replica: ReplicaId) -> UInt32[Array, "2"]:
+    """The random key of a replica, as numbers: that of its seed, with the checksum of its flow
+    folded in.
+    """
+    return _folded_key(replica.seed, np.uint32(replica.checksum))
+
+
 @persistent_jit
-def _key(seed: Array, point: Array) -> UInt32[Array, "2"]:
-    """The random key of a replica, as numbers."""
-    return jax.random.key_data(jax.random.fold_in(jax.random.key(seed), point))
+def _folded_key(seed: Array, number: Array) -> UInt32[Array, "2"]:
+    return jax.random.key_data(jax.random.fold_in(jax.random.key(seed), number))
 
 
 def _measured(
@@ -154,7 +161,7 @@ def _measured(
     """Prepare and sample the replicas of a batch."""
     flows = settings.flows()
     flow = stack([flows[point] for point, _ in task])
-    keys = np.stack([_key(settings.first_seed + seed, point) for point, seed in task])
+    keys = np.stack([random_key(replica) for replica in replica_ids(settings, task)])
     grains = settings.grains_of(flow.grains, len(task))
     batch = prepare_batch(
         flow, keys, settings.equilibrate, advance, grains=grains, numerics=settings.numerics
