@@ -69,6 +69,40 @@ def file_lock(path: Path) -> Iterator[None]:
             return
 
 
+def lock_folder(folder: Path) -> int | None:
+    """Lock a folder, made if missing, until this process ends; the handle of its file ``lock``.
+
+    On a system without locks there is no handle, and no other process is noticed.
+
+    Raises:
+      FileExistsError: a file has the name of the folder.
+      BlockingIOError: another process has locked it.
+    """
+    while True:
+        folder.mkdir(parents=True, exist_ok=True)
+        if fcntl is None:
+            return None
+        try:
+            handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+        except FileNotFoundError:  # another process has just finished and removed the folder
+            continue
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(handle)
+            raise
+        except OSError:  # a file system without locks
+            return handle
+        if is_lock_of(folder, handle):
+            return handle
+        os.close(handle)  # the lock of a removed folder: try again
+
+
+def is_lock_of(folder: Path, lock: int | None) -> bool:
+    """Whether a lock is that of this folder, and not of one that was removed since."""
+    return lock is None or same_file(lock, folder / "lock")
+
+
 def same_file(handle: int, path: Path) -> bool:
     """Whether an open file is the one that has this name now, and not one that was removed
     since.

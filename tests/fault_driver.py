@@ -35,9 +35,8 @@ run_replicas.advance_batch = advance_slowly
 
 if FAULT == "disc full":
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(
-        resource.RLIMIT_FSIZE, (80_000, 80_000)
-    )  # more than the parameters, less than a batch
+    most = 80_000  # bytes; more than a replica, less than a map
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
 
 if __name__ == "__main__":
     from jaxgran.cli.app import program

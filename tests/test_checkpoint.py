@@ -14,12 +14,13 @@ import pytest
 from flows import assert_same_bits
 from synthetic import one_sentence, random_replica, refused
 
+from jaxgran import files
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.engine import Jax
 from jaxgran.io.atomic import write_arrays
 from jaxgran.maps import checkpoint
 from jaxgran.maps.checkpoint import Checkpoint
-from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.replica import Key, Replica, replica_ids
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
@@ -53,18 +54,20 @@ def cut_off(output: Path) -> dict[Key, Replica]:
     return run.done
 
 
-def journal_of(output: Path, key: Key, settings: MapSettings = SETTINGS) -> Path:
-    """The file for the journal of a batch, as another run of these settings names it."""
+def journal_of(output: Path, keys: list[Key], settings: MapSettings = SETTINGS) -> Path:
+    """The journal of a batch, as another run of these settings names and writes it."""
     run = Checkpoint(output.with_name("another.nc"), settings, resume=False)
     run.close(finished=True)
-    return output.with_name("map.nc.unfinished") / run.journal_path([key]).name
+    path = output.with_name("map.nc.unfinished") / run.journal_path(keys).name
+    write_arrays(path, {"replicas": np.array(replica_ids(settings, keys))}, {})
+    return path
 
 
 def test_what_is_kept_comes_back_bit_for_bit(output: Path) -> None:
     kept = cut_off(output)
     resumed = Checkpoint(output, SETTINGS, resume=True)
     assert_same_bits(resumed.done, kept)
-    assert resumed.damaged == []
+    assert resumed.damaged == resumed.interrupted == []
     resumed.close(finished=True)
     assert list(output.parent.iterdir()) == []
 
@@ -76,9 +79,7 @@ def test_an_unfinished_map_is_never_overwritten(output: Path) -> None:
     Checkpoint(output, SETTINGS, resume=True).close(finished=False)
 
 
-@pytest.mark.parametrize(
-    "change", [{"solver": LOOSE}, {"restitution": (0.4, 0.9)}, {"engine": Jax()}]
-)
+@pytest.mark.parametrize("change", [{"solver": LOOSE}, {"strain": 2.5}, {"engine": Jax()}])
 def test_another_map_is_refused_and_the_difference_named(output: Path, change: dict) -> None:
     cut_off(output)
     with refused(f"has {next(iter(change))} "):
@@ -107,60 +108,89 @@ def test_files_of_another_format_are_refused_and_kept(output: Path, monkeypatch)
 
 
 @pytest.mark.parametrize("how", ["torn", "flipped", "empty"])
-def test_a_damaged_file_is_one_sentence_and_a_damaged_journal_is_removed(
+def test_damaged_settings_are_one_sentence_and_a_damaged_replica_or_journal_is_removed(
     output: Path, how: str
 ) -> None:
     cut_off(output)
     folder = output.with_name("map.nc.unfinished")
-    journal = journal_of(output, (3, 0))
-    write_arrays(journal, {"keys": np.array([[3, 0]])}, {})
-    for file in (journal, folder / "map.nc"):
+    files = [journal_of(output, [(3, 0)]), *folder.glob("replica-*-0.nc")]
+    for file in (*files, folder / "settings.nc"):
         whole = bytearray(file.read_bytes())
         middle = len(whole) // 2
         whole[middle : middle + 64] = bytes(255 - x for x in whole[middle : middle + 64])
         file.write_bytes(
             {"torn": bytes(whole[:middle]), "flipped": bytes(whole), "empty": b""}[how]
         )
-        if file == journal:
+        if file == files[-1]:
             resumed = Checkpoint(output, SETTINGS, resume=True)
-            assert (
-                resumed.journals() == []
-                and resumed.damaged == [journal.name]
-                and not journal.exists()
-            )
+            assert resumed.interrupted == [] and list(resumed.done) == [(p, 1) for p in range(3)]
+            assert sorted(resumed.damaged) == sorted(path.name for path in files)
+            assert not any(path.exists() for path in files)
             resumed.close(finished=False)
     with pytest.raises(InputError, match="damaged: remove the folder") as refused:
         Checkpoint(output, SETTINGS, resume=True)
     assert one_sentence(str(refused.value))
 
 
-def test_a_batch_is_under_way_until_it_is_written(output: Path) -> None:
+def test_a_batch_is_under_way_until_all_of_it_is_written(output: Path, monkeypatch) -> None:
+    def full_disc(path: Path, arrays, about) -> None:
+        if path.name.endswith("-1.nc"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write_arrays(path, arrays, about)
+
     run = Checkpoint(output, SETTINGS, resume=False)
-    first, second, _ = batches()
-    for batch in (first, second):
-        keys = list(batch)
-        write_arrays(run.journal_path(keys), {"keys": np.array(keys)}, {})
-    run._next_write = np.inf  # as after a write that took long
+    first, second, third = batches()
+    journals = [journal_of(output, list(batch)) for batch in (first, second)]
     run.add(first)
-    left = [path.name for path in sorted(run.folder.glob("journal-*"))]
-    assert left == [
-        run.journal_path(list(batch)).name for batch in (first, second)
-    ]  # a process that is killed now continues both
-    assert run.journals() == [list(second)]
-    run.add(second)
+    assert [path.exists() for path in journals] == [False, True]
+    with monkeypatch.context() as patch, pytest.raises(OSError):
+        patch.setattr(checkpoint, "write_arrays", full_disc)
+        run.add(second)
+    run.add(third)
+    journal_of(output, list(third))  # as of a run that ended before it removed it
     run.close(finished=False)
     resumed = Checkpoint(output, SETTINGS, resume=True)
-    assert_same_bits(resumed.done, first | second)
-    assert resumed.journals() == []
+    assert resumed.interrupted == [list(second)]
+    assert_same_bits(resumed.done, first | third)
+    resumed.add(second)
     resumed.close(finished=True)
+    assert list(output.parent.iterdir()) == []
+
+
+def test_a_map_continues_with_other_axes_seeds_and_parts_and_keeps_what_it_does_not_need(
+    output: Path,
+) -> None:
+    """Its points are (0.5, 0.5), (0.5, 0.9) and (0.6, 0.5), packing fraction and restitution."""
+    kept = cut_off(output)
+    journal_of(output, [(3, 0), (3, 1)])
+    more = replace(
+        SETTINGS, restitution=(0.5, 0.7, 0.9), packing_fraction=(0.6,), seeds=2, first_seed=1
+    )
+    resumed = Checkpoint(output, more, resume=True)
+    assert resumed.interrupted == []  # one of its seeds is not needed
+    assert_same_bits(resumed.done, {(0, 0): kept[2, 1]})
+    resumed.close(finished=True)
+    again = Checkpoint(output, SETTINGS, resume=True)
+    assert again.interrupted == [[(3, 0), (3, 1)]]
+    assert_same_bits(again.done, {key: x for key, x in kept.items() if key != (2, 1)})
+    again.close(finished=False)
+
+
+def test_with_an_error_the_number_of_seeds_is_that_of_the_unfinished_map(output: Path) -> None:
+    settings = replace(SETTINGS, strain=None, error=0.1)
+    run = Checkpoint(output, settings, resume=False)
+    run.add(batches()[0])
+    run.close(finished=False)
+    Checkpoint(output, replace(settings, restitution=(0.5,)), resume=True).close(finished=False)
+    with refused("has seeds 2, not 3"):
+        Checkpoint(output, replace(settings, seeds=3), resume=True)
 
 
 def test_a_late_worker_of_another_map_writes_into_no_file_of_this_one(output: Path) -> None:
     run = Checkpoint(output, SETTINGS, resume=False)
-    late = journal_of(output, (0, 0), replace(SETTINGS, solver=LOOSE))
-    write_arrays(late, {"keys": np.array([[0, 0]])}, {})
-    assert late != run.journal_path([(0, 0)]) and run.journals() == []
-    run.close(finished=True)
+    late = journal_of(output, [(0, 0)], replace(SETTINGS, solver=LOOSE))
+    assert late != run.journal_path([(0, 0)])
+    run.close(finished=False)
     assert list(output.parent.iterdir()) == []
 
 
@@ -174,10 +204,10 @@ def test_a_map_of_other_sources_is_not_continued(output: Path, monkeypatch) -> N
 def test_a_journal_without_its_map_is_no_part_of_the_next_one(output: Path) -> None:
     cut_off(output)
     folder = output.with_name("map.nc.unfinished")
-    write_arrays(folder / "journal-3-0.nc", {"keys": np.array([[3, 0]])}, {})
-    (folder / "map.nc").unlink()
+    journal_of(output, [(3, 0)])
+    (folder / "settings.nc").unlink()
     run = Checkpoint(output, replace(SETTINGS, solver=LOOSE), resume=False)
-    assert run.done == {} and run.journals() == []
+    assert run.done == {} and run.interrupted == []
     run.close(finished=False)
     assert list(output.parent.iterdir()) == []
 
@@ -187,7 +217,6 @@ def test_the_lock_is_taken_again_with_a_folder_that_was_removed(output: Path) ->
     first, second, _ = batches()
     run.add(first)
     shutil.rmtree(run.folder)
-    run._next_write = 0.0
     run.add(second)
     with pytest.raises(InputError, match="another process is writing"):
         Checkpoint(output, SETTINGS, resume=True)
@@ -204,7 +233,7 @@ def test_what_was_being_written_or_removed_when_a_process_was_killed_is_tidied_u
     cut_off(output)
     folder = output.with_name("map.nc.unfinished")
     for litter in (
-        folder / ".map-0123456789abcdef.nc",
+        folder / ".replica-0123456789abcdef.nc",
         output.with_name(".map-0123456789abcdef.nc"),
     ):
         litter.write_bytes(b"half")
@@ -219,9 +248,9 @@ def test_a_file_system_without_locks_is_no_obstacle(output: Path, monkeypatch) -
     def no_locks(*_) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr(checkpoint.fcntl, "flock", no_locks)
+    monkeypatch.setattr(files.fcntl, "flock", no_locks)
     kept = cut_off(output)
-    monkeypatch.setattr(checkpoint, "fcntl", None)
+    monkeypatch.setattr(files, "fcntl", None)
     resumed = Checkpoint(output, SETTINGS, resume=True)
     assert_same_bits(resumed.done, kept)
     resumed.close(finished=True)

@@ -19,14 +19,16 @@ from synthetic import random_replica, random_state, refused
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.engine import Numba
+from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.batches import points_of_part, predicted_cost
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.merge import merge_maps
 from jaxgran.maps.ratio_map import ratio_map
-from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.replica import Key, Replica, ReplicaId, replica_ids
 from jaxgran.maps.results import is_finished, open_map
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.status_report import bad_points
+from jaxgran.maps.sums import replicas_of
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 
@@ -100,6 +102,50 @@ def test_maps_of_other_seeds_make_the_map_of_all_seeds_with_the_scatter_between_
     )
 
 
+def identifiers(data: xr.DataTree) -> list[ReplicaId]:
+    """The replicas that a map has measured."""
+    settings = MapSettings(**from_attrs(data))
+    return replica_ids(settings, replicas_of(data, settings))
+
+
+def of_axes(replicas: dict[Key, Replica], **axes: Any) -> xr.DataTree:
+    """The map at some of the points and seeds, or also at others, which nobody has measured."""
+    settings = replace(SETTINGS, **axes)
+    known = dict(zip(replica_ids(SETTINGS, replicas), replicas.values(), strict=True))
+    keys = list(np.ndindex(len(settings.flows()), settings.seeds))
+    names = zip(keys, replica_ids(settings, keys), strict=True)
+    return map_dataset(settings, {key: known[name] for key, name in names if name in known}, RUN)
+
+
+UNIONS: dict[str, Any] = {
+    "lists": ({"restitution": (0.9, 0.5)}, {"restitution": (0.7,)}, {}),
+    "lists that overlap": ({"restitution": (0.5, 0.7)}, {"restitution": (0.7, 0.9)}, {}),
+    "a map and one of its points": ({}, {"restitution": (0.7,), "packing_fraction": (0.6,)}, {}),
+    "points far from each other": (
+        {"restitution": (0.5,), "packing_fraction": (0.5,)},
+        {"restitution": (0.9,), "packing_fraction": (0.6,)},
+        {"restitution": (0.5, 0.9), "packing_fraction": (0.5, 0.6)},
+    ),
+    "points and seeds": (
+        {"restitution": (0.5,), "first_seed": 1, "seeds": 2},
+        {"restitution": (0.7,), "seeds": 1},
+        {"restitution": (0.5, 0.7)},
+    ),
+    "numbers of grains": ({}, {"grains": (64, 128)}, {"grains": (64, 128)}),
+    "time steps": ({}, {"timestep": (5e-4, 1e-3)}, {"timestep": (1e-3, 5e-4)}),
+}
+
+
+@pytest.mark.parametrize("name", UNIONS)
+def test_maps_of_other_axes_make_the_map_of_all_that_they_have(replicas, name: str) -> None:
+    *parts, axes = UNIONS[name]
+    maps = [of_axes(replicas, **part) for part in parts]
+    seen = {x for one in maps for x in identifiers(one)}
+    known = zip(replica_ids(SETTINGS, replicas), replicas.items(), strict=True)
+    whole = of_axes(dict(item for number, item in known if number in seen), **axes)
+    assert_one_run(merge_maps(maps), whole)
+
+
 def earlier(data: xr.DataTree) -> xr.DataTree:
     """The same map, made with an earlier version of JAX."""
     data.attrs["version_jax"] = "0.1"
@@ -112,11 +158,14 @@ def other_sources(data: xr.DataTree) -> xr.DataTree:
 
 
 REFUSED: dict[str, Any] = {
-    "grains is 64 in map 0 and 128 in map 1": lambda x: [
+    "strain is 2.0 in map 0 and 3.0 in map 1": lambda x: [
         of_seeds(x, 0, 1),
-        of_seeds({}, 1, 1, grains=128),
+        of_seeds(x, 1, 1, strain=3.0),
     ],
-    "map 0 and map 1 have seed 1 of point 0": lambda x: [of_seeds(x, 0, 2), of_seeds(x, 1, 2)],
+    "restitution is .* in map 0 and .* in map 1": lambda x: [
+        of_axes(x, grains_by_point=(64,) * 6),
+        of_axes(x, restitution=(0.7,)),
+    ],
     "seed 1 is missing": lambda x: [of_seeds(x, 0, 1), of_seeds(x, 2, 1)],
     "by their number of seeds": lambda x: [
         of_seeds(x, 0, 1, error=0.1),

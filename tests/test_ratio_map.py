@@ -9,12 +9,12 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from command_line import made_up_replicas
 from flows import in_batches
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic import random_replica
+from synthetic import random_replica, refused
 
-from jaxgran.io.atomic import read_arrays
 from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps import run_replicas as run_replicas_module
 from jaxgran.maps.attributes import from_attrs
@@ -224,7 +224,7 @@ def test_a_map_that_is_cut_off_is_continued_and_written_once(
     monkeypatch.setattr("jaxgran.maps.batches.batch_size", lambda *_: 2)
 
     def cut_off(_: float) -> None:
-        if len(read_arrays(folder / "map.nc")[0]["keys"]):
+        if any(folder.glob("replica-*")):
             raise RuntimeError("cut off")
 
     with pytest.raises(RuntimeError, match="cut off"):
@@ -257,6 +257,26 @@ def test_an_interrupted_map_raises_with_its_finished_part(tmp_path, monkeypatch)
     )
     assert caught.value.data.attrs["project"] == "mine"
     np.testing.assert_array_equal(open_map(tmp_path / "map.nc").status, caught.value.data.status)
+
+
+def test_an_interrupted_map_continues_with_more_points(tmp_path, monkeypatch) -> None:
+    def run(*points: int, end: type[BaseException] | None = None) -> Any:
+        return made_up_replicas({(p, seed): Status.ok for p in points for seed in (0, 1)}, end)
+
+    output, more = tmp_path / "map.nc", {**SETTINGS, "restitution": (0.5, 0.7, 0.9)}
+    monkeypatch.setattr(ratio_map_module, "run_replicas", run(1, end=KeyboardInterrupt))
+    with pytest.raises(Interrupted) as caught:
+        ratio_map(**SETTINGS, output=output)
+    with refused("already exists and has a map with restitution"):
+        ratio_map(**more, output=output)
+    monkeypatch.setattr(ratio_map_module, "run_replicas", run(0, 1))
+    data = ratio_map(**more, output=output, resume=True)
+    assert data.attrs["resumed_replicas"] == 2 and np.all(data.status >= 0)
+    xr.testing.assert_equal(
+        data.force_ratio.isel(restitution=2), caught.value.data.force_ratio.isel(restitution=1)
+    )
+    with refused("already exists and has a map with restitution"):  # it is finished
+        ratio_map(**SETTINGS, output=output, resume=True)
 
 
 def test_ratio_map_is_the_dataset_of_the_replicas(settings, results) -> None:

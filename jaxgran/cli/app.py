@@ -64,11 +64,8 @@ COMMANDS = {  # with their help here, as python -OO leaves docstrings out
     ),
     "merge": (
         merge_command,
-        "Merge the parts of a map, or maps of other seeds.",
-        (
-            "Merge the files of the parts of a map, or of maps of the same settings and other "
-            "seeds, into one."
-        ),
+        "Merge maps of other parts, seeds or points.",
+        "Merge the files of maps of the same settings and other parts, seeds or points into one.",
         MERGE_EXAMPLES,
     ),
     "plot": (

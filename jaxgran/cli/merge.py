@@ -1,4 +1,4 @@
-"""The command ``merge``: the parts of a map, or maps of other seeds, as one map."""
+"""The command ``merge``: maps of other parts, seeds or points as one map."""
 
 import os
 from pathlib import Path

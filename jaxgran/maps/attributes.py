@@ -109,8 +109,23 @@ def identity(settings: MapSettings | Mapping[str, Any]) -> dict[str, Any]:
     return json.loads(json.dumps(values, default=lambda number: number.item()))
 
 
+AXES = ("restitution", "packing_fraction", "grains", "timestep", "grains_by_point")
+"""Settings that are the lists of numbers of a map."""
+
+
+def identity_of_replicas(settings: MapSettings | Mapping[str, Any]) -> dict[str, Any]:
+    """The part of ``identity`` that all replicas of a map have in common: all but its axes, its
+    seeds and its part.
+
+    With an ``error`` the number of seeds remains, as the sampled strain depends on it.
+    """
+    values = identity(settings)
+    apart = {*AXES, "first_seed", "part", *(() if values["error"] else ("seeds",))}
+    return {name: value for name, value in values.items() if name not in apart}
+
+
 def digest(values: Mapping[str, Any]) -> str:
-    """A hash of what ``identity`` returns, and of what else is in types of JSON."""
+    """A hash of values in types of JSON."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
 
 

@@ -10,7 +10,6 @@ import jax
 
 from jaxgran.dynamics.batch import predicted_cost
 from jaxgran.dynamics.engine import in_lockstep
-from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.replica import Key
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.flow import ShearFlow
@@ -52,15 +51,6 @@ def points_of_part(settings: MapSettings) -> list[int]:
         shares[share].append(point)
         heappush(heap, (cost + costs[point], share))
     return sorted(shares[number - 1])
-
-
-def remaining_batches(settings: MapSettings, checkpoint: Checkpoint | None) -> list[list[Key]]:
-    """The batches that a checkpoint does not have yet, the interrupted ones first."""
-    if checkpoint is None:
-        return batches(settings)
-    interrupted = checkpoint.journals()
-    excluded = {*checkpoint.done, *(key for task in interrupted for key in task)}
-    return interrupted + batches(settings, excluded)
 
 
 def batches(settings: MapSettings, without: Container[Key] = ()) -> list[list[Key]]:

@@ -4,25 +4,25 @@ complete.
 ==================  ================================================================================
 file                content
 ==================  ================================================================================
-``map.nc``          the finished replicas, all parameters of the map, and the versions that its
-                    results depend on
-``journal-*.nc``    a batch that is running, see ``journal``; the end of its name is a hash of the
-                    parameters, versions and sources
+``settings.nc``     all that the numbers of a replica depend on but its ``ReplicaId``: settings,
+                    versions, sources, precision and device
+``replica-*.nc``    a finished replica, named after its ``ReplicaId``
+``journal-*.nc``    a batch that is running, see ``journal``, named after its first replica; the end
+                    of the name is a hash of what ``settings.nc`` has
 ``lock``            locked by the process that writes here; released when that process ends for any
                     reason
 ==================  ================================================================================
 
-``map.nc`` is written again whenever a batch ends, but at most so often that this takes a twentieth
-of the time; the journals of batches that it lacks stay. Every file has a checksum. A damaged
-journal is removed, and its replicas are computed again.
+So a map is continued with other lists of numbers and other seeds too. Files of replicas that it
+does not have are left alone, also when it is finished. Every file has a checksum. A damaged replica
+or journal is removed, and its replicas are computed again.
 """
 
 import glob
 import os
 import shutil
-import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -31,24 +31,18 @@ import numpy as np
 
 from jaxgran.dynamics.tally import TABLE, flat_tally, tally_from_flat
 from jaxgran.environment import default_device, precision
-from jaxgran.files import same_file
+from jaxgran.files import is_lock_of, lock_folder
 from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
-from jaxgran.maps.attributes import digest, first_difference, identity
+from jaxgran.maps.attributes import digest, first_difference, identity_of_replicas
+from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.own_observables import sums_by_name
 from jaxgran.maps.provenance import made_with, versions_of
-from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.replica import Key, Replica, ReplicaId, replica_ids
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.sampling.sample import Sample
-
-try:
-    import fcntl
-except ImportError:  # a system without such locks: a second run on one output is not detected
-    fcntl = None
-
-WRITING_SHARE = 0.05  # largest share of the time that is spent on writing
 
 
 class Checkpoint:
@@ -59,21 +53,27 @@ class Checkpoint:
       settings: the map.
       resume: whether to continue the unfinished map of an earlier run.
 
+    Attributes:
+      done: the finished replicas of this map.
+      interrupted: batches of an earlier run that continue from their journals.
+      damaged: names of the damaged files that were removed.
+
     Raises:
       InputError: (a ValueError) another process writes to this output. Or there is an unfinished
-        map, and ``resume`` is False or its parameters or versions differ; the message names the
-        difference.
+        map, and ``resume`` is False or something but lists, seeds and part differs; the message
+        names the difference.
     """
 
     def __init__(self, output: Path, settings: MapSettings, resume: bool):
-        self.folder = output.with_name(f"{output.name}.unfinished")
+        self.folder = checkpoint_folder(output)
         self.settings, self._output = settings, output
         self.done: dict[Key, Replica] = {}
+        self.interrupted: list[list[Key]] = []
         self.damaged: list[str] = []
+        keys = list(product(points_of_part(settings), range(settings.seeds)))
+        self._ids = dict(zip(keys, replica_ids(settings, keys), strict=True))
         self._identity = _identity(settings)
-        self._name = digest(self._identity)
-        self._ended: list[Path] = []  # journals of the batches that map.nc lacks
-        self._next_write = 0.0
+        self._digest = digest(self._identity)
         self._lock = _locked(self.folder, output)
         try:
             self._remove_leftovers()
@@ -84,55 +84,42 @@ class Checkpoint:
 
     def add(self, replicas: Mapping[Key, Replica]) -> None:
         """Keep the replicas of a finished batch."""
+        try:
+            self._write(replicas)
+        except FileNotFoundError:  # the folder was removed by hand
+            self._unlock()
+            self._lock = _locked(self.folder, self._output)
+            self._write_settings()
+            self._write({**self.done, **replicas})
         self.done |= replicas
-        self._ended.append(self.journal_path(list(replicas)))
-        begun = time.monotonic()
-        if begun >= self._next_write:
-            self._write()
-            ended = time.monotonic()
-            self._next_write = ended + (ended - begun) / WRITING_SHARE
+        self.journal_path(list(replicas)).unlink(missing_ok=True)
 
     def journal_path(self, keys: Sequence[Key]) -> Path:
-        """The file for the journal of a batch, named after its first replica and all that its
+        """The file for the journal of a batch, named after its first replica and all else that its
         numbers depend on.
 
         So a worker of an earlier map that still writes here writes no file of this one.
         """
-        point, seed = keys[0]
-        return self.folder / f"journal-{point}-{seed}-{self._name}.nc"
-
-    def journals(self) -> list[list[Key]]:
-        """The interrupted batches that can be continued from their journals."""
-        found: list[list[Key]] = []
-        for path in self._journals():
-            try:
-                keys = [(point, seed) for point, seed in read_arrays(path)[0]["keys"].tolist()]
-            except CorruptFile:
-                self.damaged.append(path.name)
-                path.unlink(missing_ok=True)
-                continue
-            if self.done.keys() & set(
-                keys
-            ):  # its journal was about to be removed when the run ended
-                path.unlink(missing_ok=True)
-            else:
-                found.append(keys)
-        return found
+        return self.folder / f"journal-{_name(self._ids[keys[0]])}-{self._digest}.nc"
 
     def close(self, finished: bool) -> None:
-        """Release the lock, and remove the folder if the map is finished or has not begun."""
-        if not finished and self._ended:
-            with suppress(OSError):  # the disc is full: the journals stay
-                self._write()
-        if (finished or not (self.done or self._journals())) and _is_lock_of(
-            self.folder, self._lock
-        ):
-            try:  # renamed in one operation, so that the next run finds the whole folder or none
-                os.replace(self.folder, self._discarded)
-            except OSError:
-                shutil.rmtree(self.folder, ignore_errors=True)
-            shutil.rmtree(self._discarded, ignore_errors=True)
+        """Release the lock, and remove the files of this map if it is finished, and the folder if
+        it has no others.
+        """
+        if is_lock_of(self.folder, self._lock):
+            if finished:
+                for key in self._ids:
+                    self._path(key).unlink(missing_ok=True)
+            if not self._files(self._digest):
+                self._remove_folder()
         self._unlock()
+
+    def _remove_folder(self) -> None:
+        try:  # renamed in one operation, so that the next run finds the whole folder or none
+            os.replace(self.folder, self._discarded)
+        except OSError:
+            shutil.rmtree(self.folder, ignore_errors=True)
+        shutil.rmtree(self._discarded, ignore_errors=True)
 
     @property
     def _discarded(self) -> Path:
@@ -150,104 +137,123 @@ class Checkpoint:
             path.unlink(missing_ok=True)
 
     def _begin(self, resume: bool) -> None:
-        """Read the unfinished map that is there, or write the parameters of a new one."""
-        path = self.folder / "map.nc"
-        if path.exists():
-            try:
-                arrays, begun = read_arrays(path)
-            except CorruptFile:
-                raise InputError(
-                    f"the file map.nc in {str(self.folder)!r} is damaged: remove the folder."
-                ) from None
-            if len(arrays["keys"]) or any(self.folder.glob("journal-*.nc")):
-                if not resume:
-                    raise InputError(
-                        f"output {str(self._output)!r} has an unfinished map: pass `resume=True` "
-                        f"to continue it, or remove the folder {str(self.folder)!r}.",
-                        field="output",
-                    )
-                self._require_same(begun)
-                self.done = _replicas_of(arrays, self.settings)
-                return
-        for journal in self.folder.glob("journal-*.nc"):
-            journal.unlink()
-        self._write()
-
-    def _journals(self) -> list[Path]:
-        return sorted(self.folder.glob(f"journal-*-{self._name}.nc"))
-
-    def _unlock(self) -> None:
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
-
-    def _write(self) -> None:
-        path, arrays = self.folder / "map.nc", _arrays_of(self.done)
+        """Read the unfinished map that is there, or write the settings of a new one."""
+        path = self.folder / "settings.nc"
         try:
-            write_arrays(path, arrays, self._identity)
-        except FileNotFoundError:  # the folder was removed by hand
-            self._unlock()
-            self._lock = _locked(self.folder, self._output)
-            write_arrays(path, arrays, self._identity)
-        for journal in self._ended:
-            journal.unlink(missing_ok=True)
-        self._ended = []
-
-    def _require_same(self, begun: Mapping[str, object]) -> None:
-        """Raise an InputError with the first difference between this map and the unfinished one."""
+            begun = read_arrays(path)[1] if path.exists() else {}
+        except CorruptFile:
+            raise InputError(
+                f"the file settings.nc in {str(self.folder)!r} is damaged: remove the folder."
+            ) from None
+        if not (begun and self._files(digest(begun))):
+            for path in self.folder.glob("*.nc"):
+                path.unlink()
+            self._write_settings()
+            return
+        if not resume:
+            raise InputError(
+                f"output {str(self._output)!r} has an unfinished map: pass `resume=True` "
+                f"to continue it, or remove the folder {str(self.folder)!r}.",
+                field="output",
+            )
         if difference := first_difference(self._identity, begun):
             name, here, there = difference
             raise InputError(
                 f"the unfinished map in {str(self.folder)!r} has {name} {there!r}, not {here!r}: "
                 "resume it with the same parameters, or remove the folder."
             )
+        self._read()
+
+    def _files(self, digest: str) -> list[Path]:
+        """The replicas and journals of a map."""
+        patterns = "replica-*.nc", f"journal-*-{digest}.nc"
+        return sorted(path for pattern in patterns for path in self.folder.glob(pattern))
+
+    def _path(self, key: Key) -> Path:
+        return self.folder / f"replica-{_name(self._ids[key])}.nc"
+
+    def _read(self) -> None:
+        """Read the replicas of this map, and which of its batches have a journal."""
+        there = {path.name for path in self.folder.iterdir()}
+        own_sums = sums_by_name(self.settings)
+        for key, replica in self._ids.items():
+            path = self._path(key)
+            if path.name in there and (content := self._content(path)):
+                self.done[key] = _replica_of(replica.grains, own_sums, *content)
+        keys: dict[tuple, Key] = {replica: key for key, replica in self._ids.items()}
+        started: set[Key] = set()
+        for path in sorted(self.folder.glob(f"journal-*-{self._digest}.nc")):
+            if content := self._content(path):
+                replicas = [tuple(numbers) for numbers in content[0]["replicas"].tolist()]
+                batch = [keys[replica] for replica in replicas if replica in keys]
+                if len(batch) < len(replicas) or started & set(batch):
+                    continue  # also of other points, or of another batch
+                if self.done.keys() >= set(batch):  # the run ended before it removed the journal
+                    path.unlink(missing_ok=True)
+                    continue
+                self.interrupted.append(batch)
+                started |= set(batch)
+        self.done = {key: x for key, x in self.done.items() if key not in started}
+
+    def _content(self, path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
+        """The content of a file; None where it was damaged, and is removed."""
+        try:
+            return read_arrays(path)
+        except CorruptFile:
+            self.damaged.append(path.name)
+            path.unlink(missing_ok=True)
+            return None
+
+    def _write(self, replicas: Mapping[Key, Replica]) -> None:
+        for key, replica in replicas.items():
+            write_arrays(self._path(key), *_content_of(replica))
+
+    def _write_settings(self) -> None:
+        write_arrays(self.folder / "settings.nc", {}, self._identity)
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
 
-def _arrays_of(replicas: Mapping[Key, Replica]) -> dict[str, np.ndarray]:
-    """Replicas as arrays for a file, in which each state has arrays of its own."""
-    tallies = [
-        flat_tally(one.sample.tally, np.shape(one.sample.tally.steps)) for one in replicas.values()
-    ]
+def checkpoint_folder(output: Path) -> Path:
+    """The folder of the checkpoint of a map."""
+    return output.with_name(f"{output.name}.unfinished")
+
+
+def _name(replica: ReplicaId) -> str:
+    """The numbers of a replica, as a part of the name of a file."""
+    return "-".join(map(repr, replica))
+
+
+def _content_of(replica: Replica) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """A replica as arrays and a description for ``write_arrays``."""
+    sample = replica.sample
     arrays = {
-        "keys": np.array([(*key, one.status) for key, one in replicas.items()], np.int64).reshape(
-            -1, 3
-        ),
-        "tallies": np.array(tallies),
-        "numbers": np.array(
-            [(one.strain, one.sample.area, one.sample.shear_rate) for one in replicas.values()],
-            float,
-        ),
+        "tally": flat_tally(sample.tally, np.shape(sample.tally.steps)),
+        "area": np.asarray(sample.area),
+        "shear_rate": np.asarray(sample.shear_rate),
     }
-    for row, one in enumerate(replicas.values()):
-        if one.state is not None:
-            leaves = enumerate(jax.tree.leaves(one.state))
-            arrays |= {f"state-{row}-{k}": np.asarray(x) for k, x in leaves}
-    return arrays
+    arrays |= {f"state_{k}": np.asarray(x) for k, x in enumerate(jax.tree.leaves(replica.state))}
+    return arrays, {"status": int(replica.status), "strain": float(replica.strain)}
 
 
-def _replicas_of(arrays: Mapping[str, np.ndarray], settings: MapSettings) -> dict[Key, Replica]:
-    """The replicas of ``_arrays_of``."""
-    dtype, own_sums, flows = np.dtype(precision()), sums_by_name(settings), settings.flows()
-    replicas = {}
-    for row, ((point, seed, status), tally, (strain, area, shear_rate)) in enumerate(
-        zip(arrays["keys"].tolist(), arrays["tallies"], arrays["numbers"], strict=True)
-    ):
-        tallies = tally_from_flat(tally, dtype, own_sums)
-        sample = Sample(tallies, dtype.type(area), dtype.type(shear_rate), flows[point].grains)
-        state = None
-        if f"state-{row}-0" in arrays:
-            found: list[Any] = [
-                arrays[f"state-{row}-{k}"] for k in range(6)
-            ]  # the leaves of a state
-            state = State(Grains(*found[:2]), *found[2:])
-        replicas[point, seed] = Replica(sample, status, float(strain), state)
-    return replicas
+def _replica_of(
+    grains: int, own_sums: Any, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]
+) -> Replica:
+    """The replica of ``_content_of``."""
+    tally = tally_from_flat(arrays["tally"], np.dtype(precision()), own_sums)
+    sample = Sample(tally, arrays["area"][()], arrays["shear_rate"][()], grains)
+    leaves: list[Any] = [arrays[name] for name in sorted(arrays) if name.startswith("state_")]
+    state = State(Grains(*leaves[:2]), *leaves[2:]) if leaves else None
+    return Replica(sample, about["status"], about["strain"], state)
 
 
 def _identity(settings: MapSettings) -> dict[str, Any]:
     """All that the results depend on, bit for bit, in types of JSON."""
     return {
-        **identity(settings),
+        **identity_of_replicas(settings),
         **versions_of(made_with()),
         "precision": precision(),
         "device": default_device().platform,
@@ -256,40 +262,15 @@ def _identity(settings: MapSettings) -> dict[str, Any]:
 
 
 def _locked(folder: Path, output: Path) -> int | None:
-    """Lock a folder, made if missing, until this process ends; InputError if another process has
-    locked it.
-
-    On a file system without locks, a second run on one output is not detected.
-    """
-    while True:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except FileExistsError:
-            raise InputError(
-                f"output needs the folder {str(folder)!r}, and a file has this name: rename it.",
-                field="output",
-            ) from None
-        if fcntl is None:
-            return None
-        try:
-            handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o644)
-        except FileNotFoundError:  # another process has just finished and removed the folder
-            continue
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(handle)
-            raise InputError(
-                f"another process is writing {str(output)!r}: wait for it, or choose another "
-                "`output`."
-            ) from None
-        except OSError:
-            return handle
-        if _is_lock_of(folder, handle):
-            return handle
-        os.close(handle)  # the lock of a removed folder: try again
-
-
-def _is_lock_of(folder: Path, lock: int | None) -> bool:
-    """Whether the lock is that of this folder, and not of one that was removed since."""
-    return lock is None or same_file(lock, folder / "lock")
+    """The lock of a folder, made if missing; InputError if another process has it."""
+    try:
+        return lock_folder(folder)
+    except FileExistsError:
+        raise InputError(
+            f"output needs the folder {str(folder)!r}, and a file has this name: rename it.",
+            field="output",
+        ) from None
+    except BlockingIOError:
+        raise InputError(
+            f"another process is writing {str(output)!r}: wait for it, or choose another `output`."
+        ) from None

@@ -19,6 +19,7 @@ from jaxtyping import Array
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.tally import Tally, flat_tally, tally_from_flat
 from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
+from jaxgran.maps.replica import ReplicaId
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 from jaxgran.sampling.observe import Observable, ObserveBatch, observed_shapes
@@ -35,16 +36,16 @@ class Journal:
     Args:
       path: file of the journal. If its folder is removed, the journal is not written, and the batch
         continues.
-      keys: point and seed of each replica of the batch, in order.
+      replicas: what identifies each replica of the batch, in order.
       advance: advances the batch after the end of the journal.
 
     Raises:
       CorruptFile: the file is the journal of another batch, or cannot be read.
     """
 
-    def __init__(self, path: Path, keys: Sequence[Sequence[int]], advance: ObserveBatch):
+    def __init__(self, path: Path, replicas: Sequence[ReplicaId], advance: ObserveBatch):
         self.path, self.advance = path, advance
-        self.keys = np.asarray(keys, np.int64)
+        self.replicas = np.asarray(replicas, float)
         self.steps: list[np.ndarray] = []
         self.tallies: list[np.ndarray] = []
         self.leaves: list[np.ndarray] = []
@@ -98,13 +99,13 @@ class Journal:
         with suppress(
             FileNotFoundError
         ):  # the folder was removed; ``Checkpoint.add`` makes it again
-            write_arrays(self.path, {"keys": self.keys, **series, **states}, {})
+            write_arrays(self.path, {"replicas": self.replicas, **series, **states}, {})
         now = time.monotonic()
         self.next = now + max(SECONDS, min((now - begun) / WRITING_SHARE, _LONGEST_PAUSE))
 
     def _read(self) -> None:
         arrays, _ = read_arrays(self.path)
-        if not np.array_equal(arrays["keys"], self.keys):
+        if not np.array_equal(arrays["replicas"], self.replicas):
             raise CorruptFile(f"{self.path.name} is the journal of another batch")
         self.steps, self.tallies = list(arrays["steps"]), list(arrays["tallies"])
         self.leaves = [arrays[f"state_{k}"] for k in range(len(arrays) - 3)]

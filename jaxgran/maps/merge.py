@@ -1,26 +1,32 @@
-"""Merge maps: parts of one map that ran apart, and maps of the same settings with other seeds."""
+"""Merge maps: the union of their replicas, which are identified by α, ν, N, dt and seed."""
 
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import xarray as xr
 
 from jaxgran.contact.projected_methods import ProjectedMethod, solver_text
-from jaxgran.maps.attributes import first_difference, from_attrs, identity
+from jaxgran.maps.attributes import AXES, first_difference, from_attrs, identity_of_replicas
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.own_observables import identity_of
 from jaxgran.maps.provenance import DECIDING
-from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.replica import Replica, ReplicaId, replica_ids
 from jaxgran.maps.results import open_map
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.sums import replicas_of
 from jaxgran.model.checks import InputError, short_repr
 
-_OF_PARTS = ("first_seed", "seeds", "part")  # in which the maps may differ
+_LEFT_OUT = (
+    *(*AXES, "first_seed", "seeds", "part", "part_points"),
+    *("history", "command", "replica_steps_per_second", "workers"),
+)
+"""Attributes of the maps that are not those of the merged one."""
 _SUMMED = ("wall_time_seconds", "resumed_replicas")
 _EQUAL = ("precision", "code_digest", *(f"version_{name}" for name in DECIDING))
 
@@ -30,32 +36,31 @@ def merge_maps(
     observe: Callable[..., Any] | None = None,
     solver: ProjectedMethod | None = None,
 ) -> xr.DataTree:
-    """One map of the replicas of several maps: of parts, of other seeds, or of both.
+    """One map of the replicas of several maps: of parts, of other seeds, or of other axes.
 
-    The result is that of one run, bit for bit: averages, standard errors and all else are computed
-    from the sums of all replicas, so the scatter between seeds of different maps is in the errors.
-    Points that no map has are NaN with the status ``not_run``.
+    Each axis of the result has the values of all maps. The result is that of one run, bit for bit:
+    averages, standard errors and all else are computed from the sums of all replicas, so the
+    scatter between seeds of different maps is in the errors. A replica that several maps have is
+    that of the first of them. Points that no map has are NaN with the status ``not_run``.
 
     Args:
-      maps: data of maps, as ``ratio_map`` returns them, or their files. They have the same settings
-        except ``part``, ``seeds`` and ``first_seed``, and their seeds follow one another.
+      maps: data of maps, as ``ratio_map`` returns them, or their files. All settings but the axes,
+        ``part``, ``seeds`` and ``first_seed`` are the same, and the seeds follow one another.
       observe: the function that the maps were made with, if they were made with one, as files do
         not contain it.
       solver: the solver that the maps were made with, if it is of the user's own class, as files do
         not contain it.
 
     Raises:
-      InputError: (a ValueError) the maps differ in a setting, a version or the precision; two have
-        the same replica; seeds are missing in between; or a map has no sums, as those that an
-        earlier version wrote.
+      InputError: (a ValueError) the maps differ in a setting, a version or the precision; seeds are
+        missing in between; or a map has no sums, as those that an earlier version wrote.
 
     Examples:
       >>> from jaxgran import ratio_map
-      >>> settings = dict(restitution=[0.9], packing_fraction=[0.5], grains=16, seeds=1)
-      >>> settings |= dict(strain=0.4, equilibrate=0.0)
-      >>> merged = merge_maps([ratio_map(**settings), ratio_map(**settings, first_seed=1)])
-      >>> merged["sums"].sizes["seed"]
-      2
+      >>> settings = dict(packing_fraction=[0.5], grains=16, seeds=1, strain=0.4, equilibrate=0.0)
+      >>> maps = [ratio_map(alpha, **settings) for alpha in ([0.8], [0.9])]
+      >>> merge_maps(maps).restitution.values.tolist()
+      [0.8, 0.9]
     """
     path = (str, os.PathLike)
     is_list = isinstance(maps, (list, tuple)) and len(maps) > 0
@@ -68,79 +73,82 @@ def merge_maps(
     ]
     opened = [open_map(one) if isinstance(one, path) else one for one in maps]
     chosen = [from_attrs(one) for one in opened]
-    compared = [
-        identity(settings) | {name: data.attrs.get(name) for name in _EQUAL}
-        for settings, data in zip(chosen, opened, strict=True)
-    ]
+    _require_same(names, chosen, opened)
+    method: Any = chosen[0]["solver"] if solver is None else solver
+    text = identity_of_replicas(chosen[0])["solver"]
+    if isinstance(method, str) or solver_text(method) != text:  # a text is that of a user's class
+        raise InputError(f"solver must be that of the maps, which is {text}.")
+    given = {"observe": observe, "solver": method}
+    with jax.enable_x64(opened[0].attrs["precision"] == "float64"):
+        return _union([MapSettings(**{**one, **given}) for one in chosen], chosen, opened)
+
+
+def _require_same(
+    names: Sequence[str], chosen: Sequence[dict[str, Any]], maps: Sequence[xr.DataTree]
+) -> None:
+    """Raise an InputError unless the replicas of all maps belong to one."""
+    compared = []
+    for settings, data in zip(chosen, maps, strict=True):
+        of_run = {name: data.attrs.get(name) for name in _EQUAL}
+        compared.append(identity_of_replicas(settings) | of_run)
+        if any("grains_by_point" in one for one in chosen):
+            compared[-1] |= {name: settings.get(name) for name in AXES}
     for name, values in zip(names, compared, strict=True):
-        if difference := first_difference(compared[0], values, but=_OF_PARTS):
+        if difference := first_difference(compared[0], values):
             key, *both = difference
             first, other = map(short_repr, both)
             raise InputError(
                 f"maps must have the same settings, and {key} is {first} in {names[0]} and {other} "
                 f"in {name}."
             )
-    seeds = {one["first_seed"] + seed for one in chosen for seed in range(one["seeds"])}
-    if missing := {*range(min(seeds), max(seeds))} - seeds:
-        raise InputError(
-            f"the seeds of the maps must follow one another, and seed {min(missing)} is missing."
-        )
-    if "error" in chosen[0] and {one["seeds"] for one in chosen} != {len(seeds)}:
-        raise InputError(
-            "maps with an `error` sample by their number of seeds, so they cannot be merged with "
-            "other seeds."
-        )
-    method: Any = chosen[0]["solver"] if solver is None else solver
-    text = compared[0]["solver"]
-    if isinstance(method, str) or solver_text(method) != text:  # a text is that of a user's class
-        raise InputError(f"solver must be that of the maps, which is {text}.")
-    merged = {"first_seed": min(seeds), "seeds": len(seeds), "part": None}
-    with jax.enable_x64(opened[0].attrs["precision"] == "float64"):
-        settings = MapSettings(**{**chosen[0], **merged, "observe": observe, "solver": method})
-        return _joined(names, chosen, opened, settings)
 
 
-def _joined(
-    names: list[str],
-    chosen: list[dict[str, Any]],
-    opened: Sequence[xr.DataTree],
-    settings: MapSettings,
+def _union(
+    parts: Sequence[MapSettings], chosen: Sequence[dict[str, Any]], maps: Sequence[xr.DataTree]
 ) -> xr.DataTree:
     """The map of all replicas."""
+    settings = _union_of_settings(parts)
     if identity_of(settings) != chosen[0].get("observe"):
         raise InputError(
             f"observe must be the function of the maps, which is {chosen[0].get('observe')}."
         )
-    replicas: dict[Key, Replica | None] = {}
-    origin: dict[Key, str] = {}
-    for name, one, data in zip(names, chosen, opened, strict=True):
-        offset = one["first_seed"] - settings.first_seed
-        for (point, seed), replica in replicas_of(
-            data, replace(settings, seeds=one["seeds"])
-        ).items():
-            key = point, seed + offset
-            if key in replicas:
-                where = f"seed {key[1] + settings.first_seed} of point {point}"
-                raise InputError(
-                    f"maps must have no replica in common, and {origin[key]} and {name} have "
-                    f"{where}."
-                )
-            replicas[key], origin[key] = replica, name
-    return map_dataset(settings, replicas, _attributes(opened))
+    found: dict[ReplicaId, Replica | None] = {}
+    for part, data in zip(parts, maps, strict=True):
+        replicas = replicas_of(data, part)
+        for name, replica in zip(replica_ids(part, replicas), replicas.values(), strict=True):
+            found[name] = found.get(name) or replica
+    keys = list(np.ndindex(len(settings.flows()), settings.seeds))
+    names = replica_ids(settings, keys)
+    merged = {key: found[name] for key, name in zip(keys, names, strict=True) if name in found}
+    return map_dataset(settings, merged, _attributes(maps))
+
+
+def _union_of_settings(parts: Sequence[MapSettings]) -> MapSettings:
+    """The settings with all values of the axes and all seeds."""
+    seeds = {one.first_seed + seed for one in parts for seed in range(one.seeds)}
+    if missing := {*range(min(seeds), max(seeds))} - seeds:
+        raise InputError(
+            f"the seeds of the maps must follow one another, and seed {min(missing)} is missing."
+        )
+    if parts[0].error is not None and parts[0].seeds != len(seeds):
+        raise InputError(
+            "maps with an `error` sample by their number of seeds, so they cannot be merged with "
+            "other seeds."
+        )
+    axes: dict[str, Any] = {}
+    for name in ("restitution", "packing_fraction", "grains", "timestep"):
+        lists = [np.atleast_1d(getattr(one, name)).tolist() for one in parts]
+        values = list(dict.fromkeys(chain(*lists)))
+        is_list = any(isinstance(getattr(one, name), tuple) for one in parts)
+        axes[name] = tuple(values) if is_list or len(values) > 1 else values[0]
+    seeds_of_all = {"first_seed": min(seeds), "seeds": len(seeds), "part": None}
+    return replace(parts[0], **axes, **seeds_of_all)
 
 
 def _attributes(maps: Sequence[xr.DataTree]) -> dict[str, Any]:
     """Attributes of the runs: times add up, and what differs is listed."""
-    left_out = {
-        *_OF_PARTS,
-        "part_points",
-        "history",
-        "command",
-        "replica_steps_per_second",
-        "workers",
-    }
     attributes: dict[str, Any] = {
-        str(name): value for name, value in maps[0].attrs.items() if name not in left_out
+        str(name): value for name, value in maps[0].attrs.items() if name not in _LEFT_OUT
     }
     for name, value in attributes.items():
         values = [one.attrs.get(name) for one in maps]

@@ -5,6 +5,7 @@ variables.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
     from jaxgran.maps.settings import MapSettings
     from jaxgran.model.flow import ShearFlow
     from jaxgran.sampling.sample import Sample
+
+_REFERENCE = {"restitution": 0.5, "packing_fraction": 0.5, "timestep": 1e-3}
+"""Flow for the hash of an observable, which maps of other axes have in common."""
 
 
 def require_observe(observe: Any, flow: ShearFlow) -> None:
@@ -71,10 +75,8 @@ def identity_of(settings: MapSettings) -> str | None:
     """
     if settings.observe is None:
         return None
-    return (
-        f"{', '.join(sums_by_name(settings) or ())}: "
-        f"{digest_of(settings.observe, settings.flows()[0])}"
-    )
+    flow = replace(settings.flows()[0], **_REFERENCE)
+    return f"{', '.join(sums_by_name(settings) or ())}: {digest_of(settings.observe, flow)}"
 
 
 def own_variables(

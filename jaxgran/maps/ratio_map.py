@@ -98,11 +98,11 @@ def ratio_map(
     """Force ratio, stresses and temperature over a grid of restitutions and packing fractions, with
     errors.
 
-    With ``output``, finished batches are kept in a folder beside it while the map runs: an
-    unfinished map of the same parameters is continued if ``resume`` is True and is an error
-    otherwise, and a finished one is then read from its file. A file with anything else is replaced
-    only if ``overwrite`` is True. ``save_figures`` draws the figures of ``jaxgran map``, and
-    ``open_map`` reads the file.
+    With ``output``, finished replicas are kept in a folder beside it while the map runs. If
+    ``resume`` is True, an unfinished map of the same parameters is continued, also with other axes,
+    seeds or part, and a finished one is read from its file; otherwise the former is an error. A
+    file with anything else is replaced only if ``overwrite`` is True. ``save_figures`` draws the
+    figures of ``jaxgran map``, and ``open_map`` reads the file.
 
     Args:
       {PARAMETERS}
@@ -230,10 +230,9 @@ def _workers(run: RunOptions) -> int:
 
 def _tell_resumed(settings: MapSettings, run: RunOptions, checkpoint: Checkpoint) -> None:
     """Print how much of a map is done, and which files are damaged."""
-    under_way = len(checkpoint.journals())
     run.tell(
         f"continued: {len(checkpoint.done)} of {replica_count(settings)} replicas are done, "
-        f"{under_way} batches under way."
+        f"{len(checkpoint.interrupted)} batches under way."
     )
     if checkpoint.damaged:
         run.tell(f"damaged and computed again: {', '.join(checkpoint.damaged)}.")

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import jax
@@ -19,7 +20,7 @@ from jaxtyping import Array, UInt32
 from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.dynamics.batch import in_threads, replicas_of, stack
 from jaxgran.io.atomic import CorruptFile
-from jaxgran.maps.batches import remaining_batches
+from jaxgran.maps.batches import batches
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import Provenance, run_on_cluster
 from jaxgran.maps.journal import Journal
@@ -56,7 +57,7 @@ def run_replicas(
         It has an effect only with one worker, and each of its batches is one replica.
       made: receives what the workers of a cluster computed with.
     """
-    tasks, flows = remaining_batches(settings, checkpoint), settings.flows()
+    tasks, flows = _remaining_batches(settings, checkpoint), settings.flows()
     if record is not None:  # a recorder follows one replica
         tasks = [[key] for task in tasks for key in task]
     calls = [
@@ -89,6 +90,14 @@ def run_replicas(
             yield from outcome
 
 
+def _remaining_batches(settings: MapSettings, checkpoint: Checkpoint | None) -> list[list[Key]]:
+    """The batches that a checkpoint does not have yet, the interrupted ones first."""
+    if checkpoint is None:
+        return batches(settings)
+    interrupted = checkpoint.interrupted
+    return interrupted + batches(settings, {*checkpoint.done, *chain(*interrupted)})
+
+
 def _points(settings: MapSettings, task: Sequence[Key]) -> str:
     """The points of a batch, each once, for a message."""
     flows = settings.flows()
@@ -115,9 +124,9 @@ def _run_task(
     """
     advance = _reporting(task, report)
     try:
-        return _measured(
-            settings, task, advance if journal is None else Journal(journal, task, advance), record
-        )
+        if journal is not None:
+            advance = Journal(journal, replica_ids(settings, task), advance)
+        return _measured(settings, task, advance, record)
     except CorruptFile:
         assert journal is not None
         journal.unlink(missing_ok=True)

@@ -8,9 +8,14 @@ from typing import NamedTuple
 import xarray as xr
 
 from jaxgran.maps import results
-from jaxgran.maps.attributes import first_difference, from_attrs, identity
+from jaxgran.maps.attributes import (
+    first_difference,
+    from_attrs,
+    identity,
+    identity_of_replicas,
+)
 from jaxgran.maps.batches import points_of_part
-from jaxgran.maps.checkpoint import Checkpoint
+from jaxgran.maps.checkpoint import Checkpoint, checkpoint_folder
 from jaxgran.maps.settings import MapSettings, RunOptions
 from jaxgran.model.checks import InputError, short_repr
 
@@ -53,23 +58,23 @@ def open_store(settings: MapSettings, run: RunOptions) -> Iterator[Store]:
         yield Store()
         return
     earlier, difference = earlier_map(run.output, settings)
-    if difference and not run.overwrite:
+    finished = earlier if earlier is not None and results.is_finished(earlier) else None
+    continued = run.resume and _is_unfinished(run.output, earlier, settings)
+    if difference and not (run.overwrite or continued):
         raise InputError(
             f"output {short_repr(str(run.output))} already exists and has {difference}; "
             "pass `overwrite=True` to replace it.",
             field="output",
         )
-    finished = earlier if earlier is not None and results.is_finished(earlier) else None
     checkpoint = Checkpoint(run.output, settings, run.resume)
     try:
-        is_new = not (checkpoint.done or checkpoint.journals())
+        is_new = not (checkpoint.done or checkpoint.interrupted)
         result = finished if run.resume and is_new and not difference else None
         yield Store(run.output, checkpoint, finished, result)
     except BaseException as error:
         if isinstance(error, OSError) and checkpoint.done:
-            error.add_note(
-                f"finished batches are in {checkpoint.folder}: make room and add `resume=True`"
-            )
+            note = f"finished batches are in {checkpoint.folder}: to continue, add `resume=True`"
+            error.add_note(note)
         checkpoint.close(finished=False)
         raise
     checkpoint.close(finished=len(checkpoint.done) == replica_count(settings))
@@ -92,6 +97,15 @@ def earlier_map(path: Path, settings: MapSettings) -> tuple[xr.DataTree | None, 
         name, before, now = difference
         return data, f"a map with {name} {short_repr(before)} and not {short_repr(now)}"
     return data, ""
+
+
+def _is_unfinished(path: Path, earlier: xr.DataTree | None, settings: MapSettings) -> bool:
+    """Whether the earlier map of a file is an unfinished one that settings with other axes, seeds
+    or part continue, so that its replicas are in the checkpoint.
+    """
+    if earlier is None or results.is_finished(earlier) or not checkpoint_folder(path).exists():
+        return False
+    return identity_of_replicas(from_attrs(earlier)) == identity_of_replicas(settings)
 
 
 def replica_count(settings: MapSettings) -> int:
