@@ -4,9 +4,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import pytest
+from distributed import CancelledError
+from distributed.comm import CommClosedError
 from synthetic import refused
 
 from jaxgran.maps.cluster import Provenance, run_on_cluster
@@ -49,8 +52,8 @@ def test_a_scheduler_that_does_not_answer_is_one_sentence(address: str, monkeypa
 class Done:
     """A future of a cluster, and the cluster that has just this one."""
 
-    def __init__(self, result) -> None:
-        self.result, self.loop = lambda: result, None
+    def __init__(self, outcome) -> None:
+        self.outcome, self.loop = outcome, None
 
     def __enter__(self):
         return self
@@ -61,14 +64,16 @@ class Done:
     def submit(self, *_, **__) -> "Done":
         return self
 
-    def release(self) -> None:
-        pass
+    def result(self):
+        if isinstance(self.outcome, Exception):
+            raise self.outcome
+        return self.outcome
 
 
-def outcome_of(worker: dict[str, str], monkeypatch) -> tuple[list, Provenance]:
-    """What comes from a cluster whose worker computes with this."""
+def outcome_of(outcome: Any, monkeypatch) -> tuple[list, Provenance]:
+    """What comes from a cluster whose worker returns or raises this."""
     distributed = pytest.importorskip("dask.distributed")
-    monkeypatch.setattr(distributed, "Client", lambda *_, **__: Done((worker, "result")))
+    monkeypatch.setattr(distributed, "Client", lambda *_, **__: Done(outcome))
     monkeypatch.setattr(distributed, "as_completed", lambda futures, loop: futures)
     made: Provenance = {}
     return list(run_on_cluster("tcp://x", print, [()], made)), made
@@ -76,7 +81,7 @@ def outcome_of(worker: dict[str, str], monkeypatch) -> tuple[list, Provenance]:
 
 def test_provenance_is_that_of_the_workers(monkeypatch) -> None:
     worker = made_with() | {"device": "gpu: one", "platform": "Linux, 1 cores"}
-    outcome, made = outcome_of(worker, monkeypatch)
+    outcome, made = outcome_of((worker, "result"), monkeypatch)
     assert outcome == [(0, "result")]
     assert {name: list(values) for name, values in made.items()} == {
         name: [value] for name, value in worker.items()
@@ -86,4 +91,15 @@ def test_provenance_is_that_of_the_workers(monkeypatch) -> None:
 @pytest.mark.parametrize("name", ["code_digest", "version_jax"])
 def test_a_worker_of_another_version_is_refused(name: str, monkeypatch) -> None:
     with refused("workers must have the versions of this process, and one has .* 'other', not "):
-        outcome_of(made_with() | {name: "other"}, monkeypatch)
+        outcome_of((made_with() | {name: "other"}, "result"), monkeypatch)
+
+
+def test_a_task_that_kills_its_workers_is_given_up(monkeypatch) -> None:
+    killed = pytest.importorskip("dask.distributed").KilledWorker("task", None, 3)
+    assert outcome_of(killed, monkeypatch)[0] == [(0, None)]
+
+
+@pytest.mark.parametrize("error", [CancelledError(), CommClosedError()])
+def test_a_scheduler_that_has_gone_is_an_error_of_the_connection(error, monkeypatch) -> None:
+    with pytest.raises(ConnectionError, match="the scheduler at tcp://x has gone"):
+        outcome_of(error, monkeypatch)

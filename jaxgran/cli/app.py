@@ -177,7 +177,8 @@ def _run() -> NoReturn:
             f"; {with_options(note, _parameters())}" for note in getattr(error, "__notes__", [])
         )
         file = "" if error.filename is None else f": {short_repr(str(error.filename))}"
-        stop(f"stopped by the file system, {error.strerror or error}{file}{notes}.", NO_FILE)
+        cause = ":" if isinstance(error, ConnectionError) else " by the file system,"
+        stop(f"stopped{cause} {error.strerror or error}{file}{notes}.", NO_FILE)
     except Exception as error:
         if not is_interruption(error):
             raise

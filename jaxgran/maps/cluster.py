@@ -4,13 +4,15 @@ The cluster replaces workers that die and repeats their tasks. It gives up on a 
 have died too often.
 """
 
-from collections.abc import Callable, Generator, Sequence
+import logging
+from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import jax
 
 from jaxgran.cache.folder import programs_folder, use_cache
 from jaxgran.environment import precision
+from jaxgran.maps.attributes import first_difference
 from jaxgran.maps.provenance import made_with, versions_of
 from jaxgran.model.checks import InputError
 
@@ -39,9 +41,11 @@ def run_on_cluster(
     Raises:
       InputError: (a ValueError) Dask is not installed, no scheduler answers at the address, or a
         worker has other versions than this process.
+      ConnectionError: the scheduler has gone.
     """
     try:
-        from dask.distributed import Client, KilledWorker, as_completed
+        from dask.distributed import CancelledError, Client, KilledWorker, as_completed
+        from distributed.comm import CommClosedError
     except ImportError:
         raise InputError("a scheduler needs Dask: pip install 'jaxgran[cluster]'.") from None
     try:
@@ -50,12 +54,11 @@ def run_on_cluster(
         raise InputError(
             f"no scheduler answers at {address!r}: {' '.join(str(error).split())[:80]}."
         ) from None
-    x64, caching, here = (
-        precision() == "float64",
-        programs_folder() is not None,
-        versions_of(made_with()),
-    )
+    x64, caching = precision() == "float64", programs_folder() is not None
+    here = versions_of(made_with())
     with client:
+        # Not ``client.get_executor()``: a future of it whose result is on its way when the
+        # scheduler dies never ends.
         futures = {
             client.submit(
                 _on_worker, x64, caching, function, task, pure=False, priority=-number
@@ -63,24 +66,31 @@ def run_on_cluster(
             for number, task in enumerate(tasks)
         }
         for future in as_completed(list(futures), loop=client.loop):
+            number = futures.pop(future)
             try:
                 there, result = future.result()
-                for name, version in versions_of(there).items():
-                    if version != here[name]:
-                        different = (
-                            f"{name.removeprefix('version_')} {version!r}, not {here[name]!r}"
-                        )
-                        raise InputError(
-                            "workers must have the versions of this process, and one has "
-                            f"{different}."
-                        )
-                if made is not None:
-                    for name, value in there.items():
-                        made.setdefault(name, {})[value] = None
-                yield futures[future], result
             except KilledWorker:
-                yield futures[future], None
-            future.release()
+                yield number, None
+                continue
+            except (CancelledError, CommClosedError):
+                # without the tracebacks of its attempts to connect again
+                logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+                raise ConnectionError(f"the scheduler at {address} has gone") from None
+            _require_versions(here, versions_of(there))
+            if made is not None:
+                for name, value in there.items():
+                    made.setdefault(name, {})[value] = None
+            yield number, result
+
+
+def _require_versions(here: Mapping[str, str], there: Mapping[str, str]) -> None:
+    """Raise an InputError if a worker has other versions than this process."""
+    if difference := first_difference(there, here):
+        name, other, own = difference
+        raise InputError(
+            "workers must have the versions of this process, and one has "
+            f"{name.removeprefix('version_')} {other!r}, not {own!r}."
+        )
 
 
 def _on_worker(
