@@ -21,9 +21,10 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains, own_grains, polydisperse
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
+from jaxgran.sampling.heated import heated
 from jaxgran.sampling.packing import pack, require_room
 from jaxgran.sampling.prediction import size_classes
-from jaxgran.sampling.steady_state import heated, prepare
+from jaxgran.sampling.steady_state import prepare
 from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
 
 EVEN = np.arange(GRAINS) % 2 == 0

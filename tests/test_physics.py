@@ -19,7 +19,7 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.averages import averages
-from jaxgran.sampling.steady_state import heated
+from jaxgran.sampling.heated import heated
 
 EPS = np.finfo(float).eps
 COLLISIONS, BLOCKS = 100, 50
