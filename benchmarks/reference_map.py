@@ -81,7 +81,7 @@ def check(quick: bool) -> dict[str, dict[str, Any]]:
     chosen = {"restitution": alphas, "packing_fraction": nus, "timestep": 5e-4}
     return {
         "check_small": chosen | {"grains": (64, 100) if quick else (256, 1024), "seeds": 8},
-        "check_large": chosen | {"grains": 200 if quick else 25_600, "seeds": 1},
+        "check_large": chosen | {"grains": 200 if quick else 25_600},
     }
 
 
@@ -112,14 +112,14 @@ def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT
     """Map what is missing of a part, and write it: all seeds as one map, ``reference.nc``."""
     folder = folder.with_name(f"{folder.name}_quick") if output.quick else folder
     folder.mkdir(parents=True, exist_ok=True)
-    about = {"command": "python -m benchmarks reference_map"}
+    command = "python -m benchmarks reference_map"
 
     def made(name: str, **chosen: Any) -> xr.DataTree:
         kept = {
             "output": folder / f"{name}.nc",
             "resume": True,
             "progress": True,
-            "attributes": about,
+            "attributes": {"command": command},
         }
         return jg.ratio_map(**{"seeds": 1, **chosen}, **kept, workers=usable_cores())
 
@@ -127,7 +127,7 @@ def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT
         merged = jg.merge_maps(
             [made(f"seed_{k}", **plane(output.quick), first_seed=k) for k in range(seeds)]
         )
-        merged.attrs["command"] = about["command"]
+        merged.attrs["command"] = command
         write_dataset(merged, output.path("reference", ".nc"))
         return
     for name, chosen in PARTS[part](output.quick).items():
