@@ -89,7 +89,11 @@ def write_few_variables(patch: pytest.MonkeyPatch, *more: str) -> None:
     second or two.
     """
     whole, names = results.write_dataset, ("force_ratio", "stress_ratio", *more)
-    kept = {f"{name}{end}" for name in names for end in ("", "_stderr", "_ci95")}
+    kept = {
+        f"{name}{end}"
+        for name in names
+        for end in ("", "_stderr", "_large_system", "_large_system_ci95")
+    }
     kept |= {"status", "sums/status", "sums/strain"}
     patch.setattr(
         results, "write_dataset", lambda data, path: whole(with_variables(data, *kept), path)

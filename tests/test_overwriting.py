@@ -20,7 +20,7 @@ from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.results import open_map
 from jaxgran.model.status import Status
 from jaxgran.plotting.theory import SHARES
-from jaxgran.sampling.budget import BUDGET
+from jaxgran.sampling.budget import LARGE_SYSTEM
 
 MAP = ("map", *POINTS, "--seeds", "1")
 BOTH = {(0, 0): Status.ok, (1, 0): Status.ok}
@@ -32,7 +32,7 @@ def made_up_maps(patch: pytest.MonkeyPatch) -> None:
     Their own files have what is printed and what decides which pictures there are.
     """
     write_without_drawing(patch)
-    write_few_variables(patch, *BUDGET, *SHARES)
+    write_few_variables(patch, *LARGE_SYSTEM, *SHARES)
     patch.setattr(ratio_map_module, "run_replicas", made_up_replicas(BOTH))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from jaxgran.cli.arguments import FILE, QUIET, command, of_map
-from jaxgran.cli.measure import finish, print_budget, run_map
+from jaxgran.cli.measure import finish, print_large_system, run_map
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import say_written
 from jaxgran.maps.options import Option
@@ -121,7 +121,7 @@ def print_tables(data) -> None:
             continue
         print_table(_ratio_table(part, "Force ratio", part.force_ratio, part.force_ratio_stderr))
         print_table(_ratio_table(part, "Shear-stress ratio", *shear_stress_ratio(part)))
-    print_budget(data)
+    print_large_system(data)
 
 
 def run_plot_command(

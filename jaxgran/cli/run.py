@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxgran.cli.arguments import QUIET, command, of_map
 from jaxgran.cli.json_output import JSON, Entry, print_json
-from jaxgran.cli.measure import finish, print_budget, run_map
+from jaxgran.cli.measure import finish, print_large_system, run_map
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import configured_jax, counted, say
 from jaxgran.maps.options import Option
@@ -108,7 +108,7 @@ def run_run_command(
         print_json(_entries(data))
     elif bool(data.force_ratio.notnull().any()):
         print_table(_summary_table(data, all))
-        print_budget(data)
+        print_large_system(data)
     if recorder is not None and recorder.frames:
         say(
             "recording frames split the run at different steps, so averages change within their "
@@ -182,6 +182,7 @@ def _entries(data) -> dict[str, Entry]:
     """
     from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
     from jaxgran.maps.status_report import bad_points
+    from jaxgran.sampling.budget import LARGE_SYSTEM
     from jaxgran.sampling.observables import OBSERVABLES
 
     point = flattened(data).isel(packing_fraction=0, restitution=0)
@@ -205,6 +206,11 @@ def _entries(data) -> dict[str, Entry]:
             one.unit,
             point[f"{path}_stderr"].values if f"{path}_stderr" in point else None,
         )
+    for name in LARGE_SYSTEM:
+        path, row = f"{name}_large_system", OBSERVABLES[name]
+        total = point[f"{path}_ci95"].sel(error_source="total")
+        entries[path] = Entry(point[path].values, f"{row.meaning}, of a large system", row.unit)
+        entries[f"{path}_ci95"] = Entry(total.values, total.long_name, row.unit)
     ratio, error = shear_stress_ratio(point)
     meaning = "contact shear stress over binary shear stress"
     entries["shear_stress_ratio"] = Entry(ratio.values, meaning, "1", error.values)

@@ -95,7 +95,7 @@ class Meter:
         points = sum(left == 0 for left in self.left.values())
         percent = 100 * (self.resumed_cost + done) / self.total
         left = (
-            _duration(seconds * max(self.total - self.resumed_cost - done, 0.0) / done)
+            duration(seconds * max(self.total - self.resumed_cost - done, 0.0) / done)
             if done > 0
             else "unknown time"
         )
@@ -116,7 +116,7 @@ def progress(settings: MapSettings, quiet: bool) -> Iterator[Meter]:
         meter.console.print(meter._line(), highlight=False)
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """A time as hours:minutes:seconds."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)

@@ -5,7 +5,6 @@ results do not depend on the other points of the map, on the batches, their orde
 workers.
 """
 
-import math
 import warnings
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
@@ -20,13 +19,13 @@ from jaxtyping import Array, UInt32
 from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.dynamics.batch import in_threads, replicas_of, stack
 from jaxgran.io.atomic import CorruptFile
+from jaxgran.maps.automatic import sampling_targets
 from jaxgran.maps.batches import batches
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import Provenance, run_on_cluster
 from jaxgran.maps.journal import Journal
 from jaxgran.maps.replica import Advance, Key, Replica, ReplicaId, replica_ids
 from jaxgran.maps.settings import MapSettings
-from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.observe import AdvanceWrapper, ObserveBatch, advance_batch, reporting
 from jaxgran.sampling.sample_batch import sample_batch
 from jaxgran.sampling.steady_state import prepare_batch
@@ -176,14 +175,10 @@ def _measured(
         flow, keys, settings.equilibrate, advance, grains=grains, numerics=settings.numerics
     )
     strain_before = batch.strain
-    error = (
-        None
-        if settings.error is None
-        else sampling_error(settings.error) * math.sqrt(settings.seeds)
-    )
+    targets = sampling_targets(settings, flow)
     sampling = advance if settings.observe is None else partial(advance, observe=settings.observe)
     batch, sample = sample_batch(
-        batch, settings.strain, sampling if record is None else record(sampling), error
+        batch, settings.strain, sampling if record is None else record(sampling), targets
     )
     states = replicas_of(batch.state) if settings.snapshots else [None] * len(task)
     columns = replicas_of(sample), batch.status.tolist(), strain_before.tolist(), states
