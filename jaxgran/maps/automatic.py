@@ -44,9 +44,13 @@ _SECONDS = 5e-7  # of processor time for a unit of ``predicted_cost``, at 1000 g
 
 
 class Plan(NamedTuple):
-    """What every point of a map needs for an error, (points,) each: the number of grains, the
-    strain of a seed, and the processor time of all seeds, in s, infinite where nothing reaches the
-    error.
+    """What every point of a map needs for an error.
+
+    =======  =======================================================================================
+    grains   number of grains
+    strain   strain of a sample
+    seconds  processor time of all seeds, infinite where the error is not reached
+    =======  =======================================================================================
     """
 
     grains: np.ndarray
@@ -55,42 +59,44 @@ class Plan(NamedTuple):
 
 
 def cheapest(settings: MapSettings, error: float) -> Plan:
-    """The numbers of grains that reach an error at the least cost, for the points of a plane.
+    """The numbers of grains (points,) that reach an error at the least cost."""
+    plans = plans_of_sizes(settings, error, _SIZES[_SIZES <= MAX_GRAINS])
+    best = np.argmin(plans.seconds, axis=1)
+    return Plan(*(x[np.arange(len(best)), best] for x in plans))
 
-    Of the error, the time step and the tolerance take what is given. The error of the size falls
-    with N, and sampling may take what is left. With few grains that is little, or the averages
-    scatter more, so the sample is long. With many grains the preparation is long, as the
-    correlation strain grows as √N. Strain and cost are right within a factor of two or three.
+
+def plans_of_sizes(settings: MapSettings, error: float, sizes: np.ndarray) -> Plan:
+    """What reaches an error with each number of grains, (points, sizes).
+
+    Of the error, time step and tolerance take what is given. The error of the size falls with N,
+    and sampling may take what is left. With few grains that is little, and averages scatter more,
+    so the sample is long. With many grains the preparation is long, as the correlation strain grows
+    as √N. Strain and cost are right within a factor of two or three.
     """
     flows = stack_of_any_size(settings.flows())
-    sizes = _SIZES[_SIZES <= MAX_GRAINS]
     theory = predicted(flows, settings.size_classes(np.size(flows.restitution)))
     averages = {
         name: np.asarray(getattr(theory, name), float)[:, None]
         for name in ("granular_temperature", "pressure", "shear_stress")
     }
-    area = np.pi / 4 * sizes / np.asarray(flows.packing_fraction)[:, None]
+    alpha, nu = (np.asarray(x)[:, None] for x in (flows.restitution, flows.packing_fraction))
+    area = np.pi / 4 * sizes / nu
     correlation = flow_correlation_strain(averages, sizes, sizes, area, 1.0)
     target = _targets(settings, error, flows, sizes)
-    scatter = _scatter(np.asarray(flows.restitution)[:, None], sizes)
+    # of the stresses in one correlation strain: a fit to the reference maps, within a factor of 1.5
+    scatter = 0.0245 * np.exp(0.85 * (1 - alpha)) * (sizes / 1600) ** -0.415
     samples = np.where(target > 0, (scatter / np.maximum(target, 1e-9)) ** 2, np.inf)
     least = 2 * np.maximum(LEAST_SAMPLE, SAMPLE_CORRELATION_STRAINS * correlation)
     sampled = np.maximum(least, samples / settings.seeds * correlation)
     longest = np.maximum(LONGEST_STRAIN, LONGEST_CORRELATION_STRAINS * correlation)
     prepared = np.maximum(LEAST_PREPARATION, _PREPARED * correlation)
-    strain_cost = _SECONDS * (sizes / 1000) ** 0.2 * sizes / flows.grains
     coarse = np.maximum(COARSE_TIMESTEP, np.asarray(flows.timestep))
-    seconds = (
-        settings.seeds
-        * strain_cost
-        * (
-            prepared * predicted_cost(flows, coarse)[:, None]
-            + sampled * predicted_cost(flows)[:, None]
-        )
+    strain_cost = _SECONDS * (sizes / 1000) ** 0.2 * sizes / flows.grains
+    seconds = strain_cost * (
+        prepared * predicted_cost(flows, coarse)[:, None] + sampled * predicted_cost(flows)[:, None]
     )
-    seconds = np.where(sampled <= longest, seconds, np.inf)
-    best = np.arange(len(seconds)), np.argmin(seconds, axis=1)
-    return Plan(sizes[best[1]], sampled[best], seconds[best])
+    seconds = np.where(sampled <= longest, settings.seeds * seconds, np.inf)
+    return Plan(np.broadcast_to(sizes, seconds.shape), sampled, seconds)
 
 
 def sampling_targets(settings: MapSettings, flows: ShearFlow) -> np.ndarray | None:
@@ -113,13 +119,6 @@ def _targets(
     )
     crossing = timestep * np.sqrt(_WARMEST * temperature_of(settings, flows))[:, None]
     return sampling_target(error, alpha, nu, sizes, crossing, settings.solver.tolerance)
-
-
-def _scatter(restitution: np.ndarray, grains: np.ndarray) -> np.ndarray:
-    """Relative standard error of the stresses in one correlation strain: a fit to the reference
-    maps, right within a factor of 1.5.
-    """
-    return 0.0245 * np.exp(0.85 * (1 - restitution)) * (grains / 1600) ** -0.415
 
 
 def chosen_settings(parameters: Mapping[str, Any]) -> tuple[MapSettings, str]:
@@ -156,7 +155,8 @@ def chosen_settings(parameters: Mapping[str, Any]) -> tuple[MapSettings, str]:
     if "grains" in automatic:
         if checked.error is None:
             raise InputError("`grains='auto'` requires `error`.", field="grains", value="auto")
-        plan = _plan(replace(checked, timestep=chosen["timestep"]), checked.error)
+        timestep = chosen.get("timestep", checked.timestep)
+        plan = _plan(replace(checked, timestep=timestep), checked.error)
         of_flow = plan.grains.reshape(len(checked.timesteps), -1).max(axis=0)
         by_point = (*of_flow.tolist(),) * len(checked.timesteps)  # dt compare at one N
         chosen |= {"grains": max(by_point), "grains_by_point": by_point}
@@ -177,8 +177,8 @@ def _plan(settings: MapSettings, error: float) -> Plan:
         worst = int(np.argmax(plan.seconds))
         where = point_text(stack_of_any_size(settings.flows()), worst)
         reason = (
-            f"is out of reach with {MAX_GRAINS} grains at {where}: take a larger one, more seeds "
-            "or a shorter time step"
+            f"is out of reach at {where} with up to {MAX_GRAINS} grains; take a larger one, more "
+            "seeds or a shorter time step"
         )
         raise refused("error", error, reason)
     return plan
