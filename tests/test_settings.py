@@ -145,7 +145,7 @@ def test_an_error_chooses_grains_by_point_and_one_time_step() -> None:
     flows = settings.flows()
     for flow in flows:
         assert size_error(flow.restitution, flow.packing_fraction, flow.grains) < 0.1
-        assert np.all(sampling_targets(settings, stack([flow])) > 0.05 / 1.96)
+        assert np.all(sampling_targets(settings, stack([flow])) > 0.02 / 1.96)
     assert len({flow.grains for flow in flows}) > 1
     assert f"{settings.grains} grains, 1 seed" in sentence and "error of 0.1" in sentence
     assert "strains of about" in sentence and "processor time" in sentence

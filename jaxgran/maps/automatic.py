@@ -35,7 +35,9 @@ from jaxgran.sampling.timestep import COARSE_TIMESTEP, automatic_timestep
 
 _AUTOMATIC_ERROR = 0.02  # of the stresses from an automatic time step, where no error is given
 _TIMESTEP_SHARE = 0.3  # of an error: short steps cost little
-_SAMPLING_SHARE = 0.5  # of an error, at least, also where the other parts leave less
+# Shares of an error for sampling: where the other parts leave less than the first one, the error is
+# hardly reached, and the sample is for the second one.
+_LEAST_SAMPLING_SHARE, _SAMPLING_SHARE = 0.2, 0.5
 _WARMEST = 2.0  # temperature over the expected one
 _SAFE: dict[str, Any] = {"grains": 256, "timestep": 1e-6}  # all flows accept these for "auto"
 _SIZES = np.rint(256 * 2 ** np.arange(0, 20, 0.5)).astype(int)  # few, as each one is compiled
@@ -106,8 +108,9 @@ def sampling_targets(settings: MapSettings, flows: ShearFlow) -> np.ndarray | No
     if settings.error is None:
         return None
     left = _targets(settings, settings.error, flows, np.array([flows.grains]))[:, 0]
-    least = _SAMPLING_SHARE * settings.error / HALF_INTERVAL
-    return np.maximum(left, least) * np.sqrt(settings.seeds)
+    error = settings.error / HALF_INTERVAL
+    target = np.where(left > _LEAST_SAMPLING_SHARE * error, left, _SAMPLING_SHARE * error)
+    return target * np.sqrt(settings.seeds)
 
 
 def _targets(
