@@ -13,8 +13,9 @@ from synthetic import refused
 from jaxgran.cli.map import MAP_OPTIONS
 from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.maps.automatic import chosen_settings
-from jaxgran.maps.presets import PRESETS, with_start
+from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.settings import OPTIONS, MapSettings
+from jaxgran.maps.start import with_start
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import MAX_GRAINS
 from jaxgran.sampling.budget import size_error
