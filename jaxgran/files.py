@@ -115,13 +115,13 @@ def read_cached(path: Path) -> bytes | None:
     return None
 
 
-def other_version(name: str, found: object, version: int | str) -> str:
+def other_version(name: str, stored: object, version: int | str) -> str:
     """A sentence if a file has another ``format_version`` than this version of jaxgran reads; "" if
     it has the same.
     """
-    if found == version:
+    if stored == version:
         return ""
-    has = "no format_version" if found is None else f"format_version {found}"
+    has = "no format_version" if stored is None else f"format_version {stored}"
     return f"{name} has {has}, and this version of jaxgran reads format_version {version}."
 
 

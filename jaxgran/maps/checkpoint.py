@@ -108,11 +108,11 @@ class Checkpoint:
         it has no others.
         """
         if is_locked(self._lock_path, self._lock):
-            own = {self._path(key) for key in self._ids} if finished else set()
-            if own.issuperset(self._files(self._digest)):
+            replicas = {self._path(key) for key in self._ids} if finished else set()
+            if replicas.issuperset(self._files(self._digest)):
                 self._settings_path.unlink(missing_ok=True)  # first: without it there is no map
                 shutil.rmtree(self.folder, ignore_errors=True)
-            for path in own:
+            for path in replicas:
                 path.unlink(missing_ok=True)
         self._unlock()
 
@@ -143,10 +143,10 @@ class Checkpoint:
                 field="output",
             )
         if difference := first_difference(self._identity, begun):
-            name, here, there = difference
+            name, requested, begun_with = difference
             raise InputError(
-                f"the unfinished map in {str(self.folder)!r} has {name} {there!r}, not {here!r}: "
-                "resume it with the same parameters, or remove the folder."
+                f"the unfinished map in {str(self.folder)!r} has {name} {begun_with!r}, not "
+                f"{requested!r}: resume it with the same parameters, or remove the folder."
             )
         self._read()
 

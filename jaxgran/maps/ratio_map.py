@@ -225,10 +225,10 @@ def _require_own_attributes(run: RunOptions, settings: MapSettings) -> None:
     """Raise an InputError if the user's attributes have a name of the map's; only the command may
     be given.
     """
-    own = set(run.attributes or {}) - {"command"}
-    if not own:
+    names = set(run.attributes or {}) - {"command"}
+    if not names:
         return
-    for name in own & {*OPTIONS, *run_attributes(settings), *_OF_RUN}:
+    for name in names & {*OPTIONS, *run_attributes(settings), *_OF_RUN}:
         raise refused("attributes", name, "must have names that a map does not have")
 
 
@@ -256,8 +256,8 @@ def _warn_of_bad_points(data: xr.DataTree) -> None:
     """Warn of points with a bad status and of short samples."""
     bad = bad_points(data)
     bad.pop("failed", None)  # batches that were given up have had a warning of their own
-    short = bad.pop("short_sample", [])
-    if short:
-        warnings.warn(short_samples_message(data, short), BadPoints, stacklevel=4)
+    short_samples = bad.pop("short_sample", [])
+    if short_samples:
+        warnings.warn(short_samples_message(data, short_samples), BadPoints, stacklevel=4)
     if bad:
         warnings.warn(bad_points_message(data, bad), BadPoints, stacklevel=4)

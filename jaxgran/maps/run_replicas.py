@@ -84,7 +84,8 @@ def run_replicas(
                 checkpoint.add(dict(outcome))
             if scheduler is not None:
                 keys, steps = zip(
-                    *((key, one.sample.tally.steps.sum()) for key, one in outcome), strict=True
+                    *((key, replica.sample.tally.steps.sum()) for key, replica in outcome),
+                    strict=True,
                 )
                 report(Advance(keys, [float(flows[point].timestep) for point, _ in keys], steps))
             yield from outcome

@@ -330,7 +330,7 @@ OPTIONS: dict[str, Option] = {
 
 def options(command: Command) -> dict[str, Option]:
     """The parameters that a command offers, by name."""
-    return {name: one for name, one in OPTIONS.items() if command in one.commands}
+    return {name: row for name, row in OPTIONS.items() if command in row.commands}
 
 
 def is_new_dimension(name: str) -> bool:

@@ -168,8 +168,8 @@ def _constants(part: Any) -> Iterator[np.ndarray]:
                 yield from _constants(parameter)
         yield from (np.asarray(x.val) for x in part.outvars if isinstance(x, Literal))
     elif isinstance(part, (tuple, list)):
-        for one in part:
-            yield from _constants(one)
+        for element in part:
+            yield from _constants(element)
     elif isinstance(part, (np.ndarray, jax.Array)):
         yield np.asarray(part)
 
