@@ -22,7 +22,7 @@ from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps.replica import ReplicaId
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
-from jaxgran.sampling.observe import Observable, ObserveBatch, observed_shapes
+from jaxgran.sampling.observe import Observe, ObserveBatch, observed_shapes
 
 SECONDS = 5.0  # shortest time between two writes of a journal
 WRITING_SHARE = 0.05  # largest share of the time that is spent on writing
@@ -59,7 +59,7 @@ class Journal:
         numerics: Numerics,
         state: State,
         steps: Array | np.ndarray,
-        observe: Observable | None = None,
+        observe: Observe | None = None,
     ) -> tuple[State, Tally]:
         k, self.position = self.position, self.position + 1
         if k < len(self.tallies):

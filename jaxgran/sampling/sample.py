@@ -18,7 +18,7 @@ from jaxgran.model.checks import InputError, is_traced, require_untraced
 from jaxgran.model.display import are_numbers, rounded, text_of
 from jaxgran.model.status import Status
 from jaxgran.sampling.averages import averages
-from jaxgran.sampling.observables import OBSERVABLES, Averages
+from jaxgran.sampling.observables import OBSERVABLES, Observables
 from jaxgran.statistics import (
     Estimates,
     correlation_length,
@@ -65,7 +65,7 @@ def _computed_once(compute: Callable[["Sample"], T]) -> T:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Sample(Averages, Indexable):
+class Sample(Observables, Indexable):
     """A measured strain of one replica; a batch has a leading (replicas,) axis everywhere.
 
     ==========  =========  ====  =================================================
