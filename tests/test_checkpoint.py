@@ -227,9 +227,7 @@ def test_the_lock_is_taken_again_with_a_folder_that_was_removed(output: Path) ->
     assert list(output.parent.iterdir()) == []
 
 
-def test_what_was_being_written_or_removed_when_a_process_was_killed_is_tidied_up(
-    output: Path,
-) -> None:
+def test_what_was_being_written_when_a_process_was_killed_is_tidied_up(output: Path) -> None:
     cut_off(output)
     folder = output.with_name("map.nc.unfinished")
     for litter in (
@@ -237,7 +235,6 @@ def test_what_was_being_written_or_removed_when_a_process_was_killed_is_tidied_u
         output.with_name(".map-0123456789abcdef.nc"),
     ):
         litter.write_bytes(b"half")
-    shutil.copytree(folder, output.with_name(".map.nc.unfinished"))
     other = output.with_name(".map-of-mine.nc")
     other.write_bytes(b"")
     Checkpoint(output, SETTINGS, resume=True).close(finished=True)

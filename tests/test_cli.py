@@ -39,10 +39,10 @@ from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
 from jaxgran.io.trajectory import read_trajectory
 from jaxgran.maps import ratio_map as ratio_map_module
-from jaxgran.maps.presets import combined
 from jaxgran.maps.results import open_map, write_dataset
 from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
 from jaxgran.maps.seeds import NOT_RUN
+from jaxgran.maps.start import combined
 from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
 from jaxgran.plotting.map_figures import FIGURES

@@ -19,8 +19,9 @@ from jaxgran.maps.automatic import (
     plans_of_sizes,
     sampling_targets,
 )
-from jaxgran.maps.presets import PRESETS, with_start
+from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.settings import OPTIONS, MapSettings
+from jaxgran.maps.start import with_start
 from jaxgran.model.checks import InputError
 from jaxgran.sampling.budget import size_error
 

@@ -6,7 +6,6 @@ may crash on a damaged file, never sees one. Dimensions are not named, since nam
 times as long as everything else.
 """
 
-import hashlib
 import io
 import json
 import os
@@ -17,13 +16,12 @@ from pathlib import Path
 import netCDF4  # noqa: F401 must precede h5py: if both bundle the same HDF5, netCDF4 fails when loaded second
 import numpy as np
 
-from jaxgran.files import atomic_write, other_version
+from jaxgran.files import atomic_write, other_version, with_checksum, without_checksum
 from jaxgran.model.checks import InputError, short_repr
 
 FORMAT_VERSION = 2
 """Version of the files of ``write_arrays``; a file of another one is not read."""
 
-_DIGEST = hashlib.sha256().digest_size  # bytes
 _LONGEST_NAME = 200  # bytes; file systems accept 255, and temporary files have longer names
 
 
@@ -77,9 +75,8 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[st
         file.attrs["format_version"] = FORMAT_VERSION
         file.attrs["names"] = json.dumps(list(arrays))
         file.attrs["about"] = json.dumps(about, sort_keys=True)
-    content = memory.getvalue()
     with atomic_write(path) as temporary:
-        temporary.write_bytes(content + hashlib.sha256(content).digest())
+        temporary.write_bytes(with_checksum(memory.getvalue()))
 
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
@@ -92,11 +89,10 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
     import h5py
 
     try:
-        file_bytes = path.read_bytes()
+        content = without_checksum(path.read_bytes())
     except OSError as error:
         raise CorruptFile(f"{path.name} cannot be read: {error}") from error
-    content = file_bytes[:-_DIGEST]
-    if hashlib.sha256(content).digest() != file_bytes[-_DIGEST:]:
+    if content is None:
         raise CorruptFile(f"{path.name} does not match its checksum")
     try:
         with h5py.File(io.BytesIO(content), "r") as file:

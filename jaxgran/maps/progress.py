@@ -92,15 +92,15 @@ class Meter:
 
     def _line(self) -> str:
         seconds, done = time.perf_counter() - self.start, self._cost_of_run
-        points = sum(left == 0 for left in self.left.values())
+        points = sum(seeds == 0 for seeds in self.left.values())
         percent = 100 * (self.resumed_cost + done) / self.total
-        left = (
+        time_left = (
             duration(seconds * max(self.total - self.resumed_cost - done, 0.0) / done)
             if done > 0
             else "unknown time"
         )
         speed = f"{self.done_steps / seconds:.3g} replica-steps/s"
-        return f"{points}/{len(self.left)} points, {percent:.0f} % done, {speed}, {left} left"
+        return f"{points}/{len(self.left)} points, {percent:.0f} % done, {speed}, {time_left} left"
 
 
 @contextmanager

@@ -83,7 +83,8 @@ def run_replicas(
                 checkpoint.add(dict(outcome))
             if scheduler is not None:
                 keys, steps = zip(
-                    *((key, one.sample.tally.steps.sum()) for key, one in outcome), strict=True
+                    *((key, replica.sample.tally.steps.sum()) for key, replica in outcome),
+                    strict=True,
                 )
                 report(Advance(keys, [float(flows[point].timestep) for point, _ in keys], steps))
             yield from outcome
@@ -121,11 +122,11 @@ def _run_task(
     """Prepare and sample the replicas of one batch; a batch that does not fit into memory is
     halved.
     """
-    advance = _reporting(task, report)
+    advance, replicas = _reporting(task, report), replica_ids(settings, task)
     try:
         if journal is not None:
-            advance = Journal(journal, replica_ids(settings, task), advance)
-        return _measured(settings, task, advance, record)
+            advance = Journal(journal, replicas, advance)
+        return _measured(settings, task, replicas, advance, record)
     except CorruptFile:
         assert journal is not None
         journal.unlink(missing_ok=True)
@@ -163,13 +164,14 @@ def _folded_key(seed: Array, number: Array) -> UInt32[Array, "2"]:
 def _measured(
     settings: MapSettings,
     task: Sequence[Key],
+    replicas: Sequence[ReplicaId],
     advance: ObserveBatch,
     record: AdvanceWrapper | None = None,
 ) -> list[tuple[Key, Replica]]:
     """Prepare and sample the replicas of a batch."""
     flows = settings.flows()
     flow = stack([flows[point] for point, _ in task])
-    keys = np.stack([random_key(replica) for replica in replica_ids(settings, task)])
+    keys = np.stack(list(map(random_key, replicas)))
     grains = settings.grains_of(flow.grains, len(task))
     batch = prepare_batch(
         flow, keys, settings.equilibrate, advance, grains=grains, numerics=settings.numerics

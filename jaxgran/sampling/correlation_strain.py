@@ -81,5 +81,5 @@ def length_status(strain: Any, correlation_strain: Any) -> Any:
     ``ok``.
     """
     xp = jnp if isinstance(strain, jax.Array) else np
-    short = strain < FEWEST_CORRELATION_STRAINS * correlation_strain
-    return xp.where(short, Status.short_sample.value, Status.ok.value)
+    is_short = strain < FEWEST_CORRELATION_STRAINS * correlation_strain
+    return xp.where(is_short, Status.short_sample.value, Status.ok.value)
