@@ -603,5 +603,5 @@ def test_a_full_disk_under_the_output_is_one_sentence(words: str) -> None:
     command = [sys.executable, "-m", "jaxgran", *words.split()]
     with open("/dev/full", "w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
-    said = "jaxgran: stopped by the file system, No space left on device: 'standard output'.\n"
+    said = "jaxgran: stopped by the file system, No space left on device.\n"
     assert (done.returncode, done.stderr) == (1, said)

@@ -37,7 +37,7 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from jaxgran.cli.mistakes import option_name, with_options
+from jaxgran.cli.options import option_name, with_options
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.results import open_map
 from jaxgran.maps.schema import path_of

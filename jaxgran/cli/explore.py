@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from jaxgran.cli.arguments import OVERWRITE, command
+from jaxgran.cli.options import OVERWRITE, command
 from jaxgran.cli.terminal import say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, short_repr

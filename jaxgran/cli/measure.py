@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxgran.cli.mistakes import with_options
-from jaxgran.cli.tables import Table, print_table
+from jaxgran.cli.options import with_options
+from jaxgran.cli.output import print_table
 from jaxgran.cli.terminal import (
     BAD_STATUS,
     configured_jax,
@@ -151,7 +151,7 @@ def print_large_system(data) -> None:
     title += "" if point else ": median (largest)"
     if data.attrs.get("polydispersity") != MEASURED_POLYDISPERSITY:
         title += f"\n{shown.pressure_large_system.attrs['comment']}"
-    table = Table(title, ("observable", *values, *_SMALLER.values()))
+    rows = []
     for name in _BUDGETED:
         errors = relative_ci95(data, name)
         at_size, large = shown[name].values, shown[f"{name}_large_system"].values
@@ -163,8 +163,8 @@ def print_large_system(data) -> None:
             cells = [_percent(large / at_size - 1), _percent(errors["total"])]
         parts = {source: _percent(errors[source]) for source in _SMALLER}
         parts |= {"timestep": "at its dt"} if name == "force_ratio" else {}
-        table.rows.append([name.replace("_", " "), *cells, *parts.values()])
-    print_table(table)
+        rows.append([name.replace("_", " "), *cells, *parts.values()])
+    print_table(title, ("observable", *values, *_SMALLER.values()), rows)
 
 
 def _percent(part) -> str:
