@@ -283,9 +283,9 @@ def output_of_where(restitution: float, packing_fraction: float) -> str:
         check=True,
         env=environment,
     )
-    verdict, rest = done.stdout.split("\n", 1)
-    lines = [line.rstrip() for line in rest.split("Enskog's contact pressure")[0].splitlines()]
-    return "\n".join([textwrap.fill(verdict, 110), "", *filter(None, lines)])
+    verdict, table = done.stdout.split("Reference map")[0].split("α = ")
+    lines = [line.rstrip() for line in f"α = {table}".splitlines()]
+    return "\n".join([textwrap.fill(" ".join(verdict.split()), 100), "", *filter(None, lines)])
 
 
 ENVIRONMENT = jinja2.Environment(

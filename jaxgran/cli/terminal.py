@@ -67,6 +67,7 @@ def _of_file(error: OSError, sentence: Callable[[Any], str] = str) -> str:
 
 def run_program(app: Callable[..., Any]) -> NoReturn:
     """Run the program, and end its process."""
+    status = 0
     try:
         try:
             app(prog_name="jaxgran")
