@@ -56,7 +56,7 @@ from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.engine import checked_numerics
 from jaxgran.dynamics.snapshots import Snapshot, snapshots_from
 from jaxgran.files import atomic_write, other_version
-from jaxgran.io.atomic import require_place
+from jaxgran.io.paths import require_place
 from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import centred, remap_tilt, wrap
 from jaxgran.model.checks import InputError, require_number, short_repr
