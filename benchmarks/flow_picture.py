@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 import jaxgran as jg
 from benchmarks.output import Output
-from jaxgran.analysis.force_chains import cluster_share, clusters
+from jaxgran.analysis.contacts import cluster_share, clusters
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.plotting.drawing import TWO_COLUMNS, styled
 from jaxgran.plotting.flow import (

@@ -15,7 +15,7 @@ from matplotlib.patches import Polygon
 from PIL import Image, ImageSequence
 from synthetic import snapshot_of
 
-from jaxgran.analysis.force_chains import pair_forces
+from jaxgran.analysis.contacts import pair_forces
 from jaxgran.plotting import flow, movie
 from jaxgran.plotting.drawing import empty_figure
 from jaxgran.plotting.flow import Scale, common_scale, draw_scene, flow_figure, scene_of
@@ -123,7 +123,7 @@ def test_forces_of_a_series_are_means_over_its_times() -> None:
     positions = np.random.default_rng(0).uniform(0, SIDE, (1, GRAINS, 2)).repeat(4, axis=0)
     series = snapshot_of(positions, contacts, side=SIDE)
     found = pair_forces(series)
-    np.testing.assert_array_equal(np.stack([found.i, found.j], axis=-1), [[0, 1], [1, 2], [5, 6]])
+    np.testing.assert_array_equal(found.pairs, [[0, 1], [1, 2], [5, 6]])
     np.testing.assert_allclose(found.force, [1.0, 1.0, 0.5])
     np.testing.assert_allclose(found.cluster_share, [0.25, 1.0, 0.0])
     np.testing.assert_array_equal(scene_of(series).instant.clustered, [False, True, False])

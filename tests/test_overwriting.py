@@ -112,7 +112,7 @@ def test_an_interrupted_map_does_not_replace_a_finished_one(
         )
         assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
         unfinished = tmp_path / "jaxgran_map.nc.unfinished"
-        assert len(list(unfinished.glob("replica-*.nc"))) == 1
+        assert len(list(unfinished.glob("replica-*.npz"))) == 1
         for path in unfinished.iterdir():
             path.unlink()
         unfinished.rmdir()

@@ -30,7 +30,7 @@ EXPLORE_OPTIONS = {
 def run_explore_command(
     file: Path | None, output: Path | None = None, overwrite: bool = False
 ) -> None:
-    from jaxgran.io.atomic import require_place
+    from jaxgran.io.paths import require_place
     from jaxgran.maps.results import open_map
     from jaxgran.page.document import require_plotly
     from jaxgran.page.explore import explore, shows_same_map

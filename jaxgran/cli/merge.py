@@ -29,7 +29,7 @@ def run_merge_command(
 ) -> None:
     configured_jax()
     require_device()
-    from jaxgran.io.atomic import require_place
+    from jaxgran.io.paths import require_place
     from jaxgran.maps.merge import merge_maps
     from jaxgran.maps.results import write_dataset
 

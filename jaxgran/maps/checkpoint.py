@@ -4,11 +4,11 @@ complete.
 ==================  ================================================================================
 file                content
 ==================  ================================================================================
-``settings.nc``     all that the numbers of a replica depend on but its ``ReplicaId``: settings,
+``settings.npz``    all that the numbers of a replica depend on but its ``ReplicaId``: settings,
                     versions, sources, precision and device
-``replica-*.nc``    a finished replica, named after its ``ReplicaId``
-``journal-*.nc``    a batch that is running, see ``journal``, named after its first replica; the end
-                    of the name is a hash of what ``settings.nc`` has
+``replica-*.npz``   a finished replica, named after its ``ReplicaId``
+``journal-*.npz``   a batch that is running, see ``journal``, named after its first replica; the end
+                    of the name is a hash of what ``settings.npz`` has
 ``lock``            locked by the process that writes here; released when that process ends for any
                     reason
 ==================  ================================================================================
@@ -32,7 +32,7 @@ import numpy as np
 from jaxgran.dynamics.tally import TABLE, flat_tally, tally_from_flat
 from jaxgran.environment import default_device, precision
 from jaxgran.files import is_locked, lock_file
-from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
+from jaxgran.io.arrays import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps.attributes import digest, first_difference, identity_of_replicas
 from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.own_observables import sums_by_name
@@ -66,7 +66,7 @@ class Checkpoint:
 
     def __init__(self, output: Path, settings: MapSettings, resume: bool):
         self.folder = checkpoint_folder(output)
-        self._settings_path, self._lock_path = self.folder / "settings.nc", self.folder / "lock"
+        self._settings_path, self._lock_path = self.folder / "settings.npz", self.folder / "lock"
         self.settings, self._output = settings, output
         self.done: dict[Key, Replica] = {}
         self.interrupted: list[list[Key]] = []
@@ -101,7 +101,7 @@ class Checkpoint:
 
         So a worker of an earlier map that still writes here writes no file of this one.
         """
-        return self.folder / f"journal-{_name(self._ids[keys[0]])}-{self._digest}.nc"
+        return self.folder / f"journal-{_name(self._ids[keys[0]])}-{self._digest}.npz"
 
     def close(self, finished: bool) -> None:
         """Release the lock, and remove the files of this map if it is finished, and the folder if
@@ -120,7 +120,7 @@ class Checkpoint:
         """Remove temporary files of a process that was killed while it wrote."""
         unique = "[0-9a-f]" * 16
         beside = f".{glob.escape(self._output.stem)}-{unique}{self._output.suffix}"
-        for path in [*self._output.parent.glob(beside), *self.folder.glob(f".*-{unique}.nc")]:
+        for path in [*self._output.parent.glob(beside), *self.folder.glob(f".*-{unique}.npz")]:
             path.unlink(missing_ok=True)
 
     def _begin(self, resume: bool) -> None:
@@ -129,10 +129,10 @@ class Checkpoint:
             begun = read_arrays(self._settings_path)[1] if self._settings_path.exists() else {}
         except CorruptFile:
             raise InputError(
-                f"the file settings.nc in {str(self.folder)!r} is damaged: remove the folder."
+                f"the file settings.npz in {str(self.folder)!r} is damaged: remove the folder."
             ) from None
         if not (begun and self._files(digest(begun))):
-            for path in self.folder.glob("*.nc"):
+            for path in self.folder.glob("*.npz"):
                 path.unlink()
             write_arrays(self._settings_path, {}, self._identity)
             return
@@ -152,11 +152,11 @@ class Checkpoint:
 
     def _files(self, digest: str) -> list[Path]:
         """The replicas and journals of a map."""
-        patterns = "replica-*.nc", f"journal-*-{digest}.nc"
+        patterns = "replica-*.npz", f"journal-*-{digest}.npz"
         return sorted(path for pattern in patterns for path in self.folder.glob(pattern))
 
     def _path(self, key: Key) -> Path:
-        return self.folder / f"replica-{_name(self._ids[key])}.nc"
+        return self.folder / f"replica-{_name(self._ids[key])}.npz"
 
     def _read(self) -> None:
         """Read the replicas of this map, and which of its batches have a journal."""
@@ -167,7 +167,7 @@ class Checkpoint:
             if path in files and (content := self._content(path)):
                 self.done[key] = _replica_of(replica.grains, own_sums, *content)
         keys: dict[tuple, Key] = {replica: key for key, replica in self._ids.items()}
-        for path in sorted(self.folder.glob(f"journal-*-{self._digest}.nc")):
+        for path in sorted(self.folder.glob(f"journal-*-{self._digest}.npz")):
             if content := self._content(path):
                 replicas = list(map(tuple, content[0]["replicas"].tolist()))
                 batch = [keys[replica] for replica in replicas if replica in keys]

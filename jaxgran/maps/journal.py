@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.tally import Tally, flat_tally, tally_from_flat
-from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
+from jaxgran.io.arrays import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps.replica import ReplicaId
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State

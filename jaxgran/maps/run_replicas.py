@@ -18,7 +18,7 @@ from jaxtyping import Array, UInt32
 
 from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.dynamics.batch import in_threads, replicas_of, stack
-from jaxgran.io.atomic import CorruptFile
+from jaxgran.io.arrays import CorruptFile
 from jaxgran.maps.automatic import sampling_targets
 from jaxgran.maps.batches import batches
 from jaxgran.maps.checkpoint import Checkpoint

@@ -20,7 +20,7 @@ import numpy as np
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, require_solver
 from jaxgran.dynamics.batch import stack
 from jaxgran.dynamics.engine import checked_numerics, select_engine
-from jaxgran.io.atomic import require_place
+from jaxgran.io.paths import require_place
 from jaxgran.model.checks import (
     InputError,
     refused,

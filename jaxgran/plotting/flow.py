@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.text import Annotation, Text
 
-from jaxgran.analysis.instant import Instant, instant_of
+from jaxgran.analysis.contacts import ForceNetwork, force_network
 from jaxgran.analysis.series import series
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import minimum_image
@@ -68,7 +68,7 @@ _LINE_MARGIN = 0.05  # in sides of the cell, at least half of the width of a lin
 class Scene(NamedTuple):
     """What a picture shows of a flow, in units of σ, m and 1/γ̇."""
 
-    instant: Instant
+    instant: ForceNetwork
     pressure: Float[np.ndarray, " grains"]  # Σ F r/2πr² over the contacts of each grain
     restitution: float
     packing_fraction: float
@@ -141,7 +141,7 @@ def scene_of(seen: Snapshot) -> Scene:
         raise InputError(
             "seen must be of a sheared flow: its shear rate is the unit of the picture."
         )
-    step, instant = frames.timestep[middle].item() * rate, instant_of(seen)
+    step, instant = frames.timestep[middle].item() * rate, force_network(seen)
     radii = instant.radii
     return Scene(
         instant=instant,
@@ -271,7 +271,7 @@ def show_scene(artists: Artists, scene: Scene, colour: Colour, scale: Scale) -> 
     artists.scale_label.xy = (start + length, low)
 
 
-def _segments(instant: Instant) -> tuple[np.ndarray, np.ndarray]:
+def _segments(instant: ForceNetwork) -> tuple[np.ndarray, np.ndarray]:
     """Lines and images of lines that reach into the cell: their ends (images, 2, 2) in σ, and
     indices of the pairs.
     """
@@ -287,7 +287,7 @@ def _segments(instant: Instant) -> tuple[np.ndarray, np.ndarray]:
     return ends[inside], np.tile(np.arange(len(instant.force)), len(shifts))[inside]
 
 
-def _images(instant: Instant) -> tuple[np.ndarray, np.ndarray]:
+def _images(instant: ForceNetwork) -> tuple[np.ndarray, np.ndarray]:
     """Grains and images that reach into the cell: indices of the grains (images,) and positions
     (images, 2) in σ.
     """

@@ -17,7 +17,7 @@ from PIL import Image
 
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.files import atomic_write
-from jaxgran.io.atomic import require_place
+from jaxgran.io.paths import require_place
 from jaxgran.model.checks import InputError, short_repr
 from jaxgran.plotting.drawing import empty_figure
 from jaxgran.plotting.encoding import BINARY_COLOUR
