@@ -127,6 +127,12 @@ def test_the_machine_code_by_name_is_auto_to_the_bit(flowing) -> None:
     assert_same_bits(numba(of(), state, STEPS), auto(of(), state, STEPS))
 
 
+@pytest.mark.parametrize("engine", [jg.Numba(), jg.Jax()])
+def test_a_number_of_steps_may_be_one_of_python(engine, flowing) -> None:
+    state = flowing(0.7)
+    assert_same_bits(*(jg.advance(of(), state, steps, engine=engine) for steps in (100, STEPS)))
+
+
 def test_jax_by_name_is_the_plain_advance(flowing, monkeypatch) -> None:
     monkeypatch.setattr(advance, "advance_by_jax", lambda *arguments, **_: arguments)
     monkeypatch.setattr(advance, "in_batch", lambda: True)  # so that nothing is traced

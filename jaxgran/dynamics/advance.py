@@ -100,7 +100,7 @@ def advance(
         return over_replicas(advance_one, numerics, batch, option)
     selected = select_engine(flow, numerics, state, option)
     if isinstance(selected, Numba):
-        return _numba_engine(flow, numerics.solver, state, steps)
+        return _numba_engine(flow, numerics.solver, state, jnp.asarray(steps))
     if events is not None or in_batch():
         return advance_by_jax(
             flow, numerics.solver, state, steps, free_flight, events, moving_contacts
