@@ -22,7 +22,6 @@ import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.analysis.force_chains import cluster_share, clusters
 from jaxgran.dynamics.snapshots import Snapshot
-from jaxgran.plotting.drawing import TWO_COLUMNS, styled
 from jaxgran.plotting.flow import (
     COLOUR_LABELS,
     Colour,
@@ -32,6 +31,7 @@ from jaxgran.plotting.flow import (
     force_key,
     scene_of,
 )
+from jaxgran.plotting.style import TWO_COLUMNS, styled
 
 RESTITUTIONS, PACKING_FRACTION = (0.9, 0.1), 0.8
 THINNER = 0.6  # lines of the figure, over those of a flow that fills a page

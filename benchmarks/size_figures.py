@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxgran.plotting.drawing import (
+from jaxgran.plotting.style import (
     LABEL_SIZE,
     SMALL_SIZE,
     TWO_COLUMNS,

@@ -519,7 +519,7 @@ def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
     monkeypatch.setattr(
         ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok})
     )
-    write_few_variables(monkeypatch, *theory.SHARES)
+    write_few_variables(monkeypatch, *theory.CLUSTERS)
     monkeypatch.setattr(
         Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"a picture")
     )

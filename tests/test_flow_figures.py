@@ -17,9 +17,9 @@ from synthetic import snapshot_of
 
 from jaxgran.analysis.force_chains import pair_forces
 from jaxgran.plotting import flow, movie
-from jaxgran.plotting.drawing import empty_figure
 from jaxgran.plotting.flow import Scale, common_scale, draw_scene, flow_figure, scene_of
 from jaxgran.plotting.movie import Frames, check_movie, write_movie
+from jaxgran.plotting.style import empty_figure
 
 SIDE, GRAINS = 8.0, 40
 

@@ -24,14 +24,6 @@ from jaxgran.analysis.series import series
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.checks import InputError, require_untraced, short_repr
-from jaxgran.plotting.drawing import (
-    LABEL_SIZE,
-    SMALL_SIZE,
-    TICK_SIZE,
-    empty_figure,
-    image_segments,
-    scientific,
-)
 from jaxgran.plotting.encoding import (
     BINARY_COLOUR,
     CLUSTER_COLOUR,
@@ -41,6 +33,13 @@ from jaxgran.plotting.encoding import (
     WIDEST_LINE,
     deepest,
     widest,
+)
+from jaxgran.plotting.style import (
+    LABEL_SIZE,
+    SMALL_SIZE,
+    TICK_SIZE,
+    empty_figure,
+    scientific,
 )
 
 Colour = Literal["speed", "pressure"]
@@ -278,7 +277,8 @@ def _segments(instant: Instant) -> tuple[np.ndarray, np.ndarray]:
     i, j = instant.positions[instant.pairs.T]
     branches = minimum_image(i - j, instant.side, instant.tilt)
     shifts = instant.side * np.array([(a + instant.tilt * b, b) for a, b in _LATTICE])
-    ends = image_segments(j, branches, shifts)
+    segments = np.stack([j, j + branches], axis=1)
+    ends = (segments[None] + shifts[:, None, None]).reshape(-1, 2, 2)
     along, up = ends[..., 0] - instant.tilt * ends[..., 1], ends[..., 1]
     reach = (0.5 + _LINE_MARGIN) * instant.side
     inside = np.all(

@@ -12,10 +12,11 @@ from matplotlib.figure import Figure
 from jaxgran.maps.schema import RATIO, MapData, require_map
 from jaxgran.model.checks import InputError, require_flag, require_whole, short_repr
 from jaxgran.model.choices import FileFormat
-from jaxgran.plotting.drawing import FILE_DPI, is_plane, writable_stem, write
-from jaxgran.plotting.enskog_factors import enskog_factors, has_factors
-from jaxgran.plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
-from jaxgran.plotting.size import averages_against_grains
+from jaxgran.plotting.against import averages_against_grains, ratio_against_timestep
+from jaxgran.plotting.factors import enskog_factors, has_factors
+from jaxgran.plotting.ratio import ratio_contours, ratio_curves
+from jaxgran.plotting.selection import is_plane
+from jaxgran.plotting.style import FILE_DPI, writable_stem, write
 from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
 
 
@@ -32,7 +33,7 @@ FIGURES = {
     "timestep": MapFigure(ratio_against_timestep, lambda data: data.sizes.get("timestep", 1) >= 2),
     "size": MapFigure(averages_against_grains, lambda data: data.sizes.get("grains", 1) >= 2),
     "theory": MapFigure(theory_errors, lambda data: is_plane(data) and has_theory(data)),
-    "factors": MapFigure(enskog_factors, lambda data: is_plane(data) and has_factors(data)),
+    "factors": MapFigure(enskog_factors, has_factors),
     "clusters": MapFigure(cluster_shares, has_clusters),
 }
 """All figures of a map by the ending of their files, in the order in which they are drawn."""
@@ -60,8 +61,7 @@ def save_figures(
     `{stem}_size.png`        `averages_against_grains`   at least two numbers of grains
     `{stem}_theory.png`      `theory_errors`             a plane as for the contours, and the
                                                          predictions of the theory
-    `{stem}_factors.png`     `enskog_factors`            a plane, and the factors of the error of
-                                                         the theory
+    `{stem}_factors.png`     `enskog_factors`            the factors of the error of the theory
     `{stem}_clusters.png`    `cluster_shares`            the shares of the clusters
     =======================  ==========================  ===========================================
 

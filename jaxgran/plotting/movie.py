@@ -19,7 +19,6 @@ from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.files import atomic_write
 from jaxgran.io.atomic import require_place
 from jaxgran.model.checks import InputError, short_repr
-from jaxgran.plotting.drawing import empty_figure
 from jaxgran.plotting.encoding import BINARY_COLOUR
 from jaxgran.plotting.flow import (
     COLOURS,
@@ -29,6 +28,7 @@ from jaxgran.plotting.flow import (
     show_scene,
     title_of,
 )
+from jaxgran.plotting.style import empty_figure
 
 MOST_DRAWN = 500  # frames of a movie, which are held in memory while it is written
 _WIDTH = 5.6  # inches
