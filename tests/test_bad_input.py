@@ -372,7 +372,9 @@ REFUSED: dict[str, Callable[[], Any]] = {
         SEEN, POINT, jg.gaussian(1e308)
     ),
     "it has no packing_fraction, restitution, force_": lambda: jg.ratio_curves(xr.Dataset()),
-    "it has no pressure, theory/pressure": lambda: jg.theory_errors(ratio_dataset()),
+    "it has no pressure, shear_stress, stress_ratio, theory/pressure": lambda: jg.theory_errors(
+        ratio_dataset()
+    ),
     "has 5 and 1": lambda: jg.ratio_contours(ratio_dataset(5, 1)),
     "at least two time steps, and this map has 1": lambda: jg.ratio_against_timestep(
         ratio_dataset()

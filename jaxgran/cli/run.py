@@ -171,9 +171,9 @@ def _write_movie(movie: Path, frames, quiet: bool) -> None:
     from jaxgran.plotting.movie import write_movie
 
     if not quiet:
-        say(f"drawing {len(frames.scenes)} frames")
+        say(f"drawing {len(frames)} frames")
     write_movie(movie, frames, follow=iter if quiet else partial(counted, words="frames"))
-    say(f"wrote {movie}: {len(frames.scenes)} frames")
+    say(f"wrote {movie}: {len(frames)} frames")
 
 
 def _entries(data) -> dict[str, Entry]:

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
-from jaxgran.maps.schema import MapData, require_map
+from jaxgran.maps.schema import RATIO, MapData, require_map
 from jaxgran.model.checks import InputError
 from jaxgran.plotting.ratio import set_ratio_scale
 from jaxgran.plotting.selection import describe, selection, suspect
@@ -132,7 +132,7 @@ def averages_against_grains(data: MapData) -> Figure:
 
 def _require_several(data: MapData, name: str, words: str) -> xr.Dataset:
     """Return a map, flattened; raise an InputError unless it has several values of a dimension."""
-    flat = require_map(data)
+    flat = require_map(data, *RATIO)
     count = flat.sizes.get(name, 1)
     if count < 2:
         raise InputError(f"this figure needs at least two {words}, and this map has {count}.")

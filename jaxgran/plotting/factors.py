@@ -44,8 +44,8 @@ _LABEL_HEIGHT = 0.07  # in heights of the panel
 
 
 def has_factors(data: xr.Dataset) -> bool:
-    """Return whether a map has the variables that :func:`enskog_factors` draws."""
-    return not what_lacks(data, *RATIO, *_NEEDED)
+    """Return whether a map has the variables and the range that :func:`enskog_factors` draws."""
+    return data.sizes["packing_fraction"] >= 2 and not what_lacks(data, *RATIO, *_NEEDED)
 
 
 @styled

@@ -61,7 +61,8 @@ def save_figures(
     `{stem}_size.png`        `averages_against_grains`   at least two numbers of grains
     `{stem}_theory.png`      `theory_errors`             a plane as for the contours, and the
                                                          predictions of the theory
-    `{stem}_factors.png`     `enskog_factors`            the factors of the error of the theory
+    `{stem}_factors.png`     `enskog_factors`            two packing fractions, and the factors of
+                                                         the error of the theory
     `{stem}_clusters.png`    `cluster_shares`            the shares of the clusters
     =======================  ==========================  ===========================================
 
