@@ -4,8 +4,6 @@ the number of grains.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -17,7 +15,6 @@ from jaxgran.model.checks import InputError
 from jaxgran.plotting.ratio import set_ratio_scale
 from jaxgran.plotting.selection import describe, selection, suspect
 from jaxgran.plotting.style import (
-    ALPHA_TITLE,
     RATIO_LABEL,
     TWO_COLUMNS,
     add_curve_legend,
@@ -30,7 +27,7 @@ from jaxgran.plotting.style import (
 )
 
 MOST_CURVES = 6  # of a panel
-_MOST_PANELS = 6  # packing fractions of the figure against the time step
+_MOST_ALPHAS = 3  # restitutions, where six curves are chosen among many
 _QUANTITIES = {
     "pressure": "pressure",
     "granular_temperature": "granular temperature",
@@ -41,10 +38,7 @@ _QUANTITIES = {
 @styled
 def ratio_against_timestep(data: MapData) -> Figure:
     """Return the force ratio against the time step, a curve for each restitution and packing
-    fraction.
-
-    Up to six curves share one panel. Otherwise each packing fraction has a panel: at most six
-    panels with six restitutions, evenly chosen.
+    fraction; of more than six, at most six are chosen evenly.
 
     Args:
       data: as in :func:`ratio_curves`, with a dimension `timestep` in units of 1/γ̇.
@@ -56,42 +50,23 @@ def ratio_against_timestep(data: MapData) -> Figure:
     Raises:
       InputError: (a ValueError) fewer than two time steps.
     """
-    _require_several(data, "timestep", "time steps")
-    data = selection(data, along="timestep")
-    together = data.sizes["restitution"] * data.sizes["packing_fraction"] <= MOST_CURVES
-    data, chosen = _thinned(data, MOST_CURVES, _MOST_PANELS)
-    panels = (
-        [data]
-        if together
-        else [data.isel(packing_fraction=[k]) for k in range(data.sizes["packing_fraction"])]
-    )
-    columns = math.ceil(math.sqrt(len(panels)))
-    rows = math.ceil(len(panels) / columns)
-    figure = empty_figure(TWO_COLUMNS, height=2.7 if together else 0.5 + 1.5 * rows)
-    grid = list(figure.subplots(rows, columns, sharex=True, squeeze=False).flat)
-    for axes, panel in zip(grid, panels, strict=False):
-        _draw_curves(axes, panel, "timestep", "force_ratio")
-        set_ratio_scale(axes, panel.force_ratio.values)
-        axes.set_title("" if together else rf"$\nu={panel.packing_fraction.item():.4g}$")
-    for axes in grid[len(panels) :]:
-        axes.remove()
-    for axes in grid[max(0, len(panels) - columns) : len(panels)]:
-        axes.tick_params(labelbottom=True)
-        axes.set_xlabel(r"time step $\dot{\gamma}\,\mathrm{d}t$")
-    label_log_axis(grid[0].xaxis, most=9 if columns == 1 else 3)
-    figure.supylabel(RATIO_LABEL)
-    labels, title = _names(panels[0], together)
-    add_curve_legend(figure, labels, title, suspect(data).any())
+    data, chosen = _several_of(data, "timestep", "time steps")
+    figure = empty_figure(TWO_COLUMNS, height=2.6)
+    axes = figure.add_subplot(xlabel=r"time step $\dot{\gamma}\,\mathrm{d}t$", ylabel=RATIO_LABEL)
+    _draw_curves(axes, data, "timestep", "force_ratio")
+    set_ratio_scale(axes, data.force_ratio.values)
+    label_log_axis(axes.xaxis)
+    _add_legend(figure, data)
     describe(figure, data, "Force ratio against the time step, with standard errors", chosen)
     return figure
 
 
 @styled
 def averages_against_grains(data: MapData) -> Figure:
-    """Return pressure, granular temperature and force ratio against the number of grains.
+    """Return pressure, granular temperature and force ratio against the number of grains, a curve
+    for each restitution and packing fraction; of more than six, at most six are chosen evenly.
 
-    Each average is divided by its value at the largest number of grains N. Every restitution and
-    packing fraction has a curve; of more than six, at most six are chosen evenly.
+    Each average is divided by its value at the largest number of grains N.
 
     Args:
       data: a map with a dimension `grains`, with `force_ratio` and any of `pressure` and
@@ -106,22 +81,19 @@ def averages_against_grains(data: MapData) -> Figure:
     Raises:
       InputError: (a ValueError) fewer than two numbers of grains.
     """
-    flat = _require_several(data, "grains", "numbers of grains")
-    names = [name for name in _QUANTITIES if name in flat and f"{name}_stderr" in flat]
-    alphas = min(flat.sizes["restitution"], max(3, MOST_CURVES // flat.sizes["packing_fraction"]))
-    data, chosen = _thinned(selection(data, *names, along="grains"), alphas, MOST_CURVES // alphas)
+    data, chosen = _several_of(data, "grains", "numbers of grains")
+    panels = [name for name in _QUANTITIES if name in data and f"{name}_stderr" in data]
     figure = empty_figure(TWO_COLUMNS, height=2.6)
-    grid = figure.subplots(1, len(names), sharex=True, sharey=True, squeeze=False)[0]
-    for axes, letter, name in zip(grid, "abc", names, strict=False):
+    grid = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, letter, name in zip(grid, "abc", panels, strict=False):
         _draw_curves(axes, data, "grains", name, relative=True)
         axes.set(xlabel="number of grains $N$", title=f"({letter}) {_QUANTITIES[name]}")
-    largest = data.grains.values[-1]
-    grid[0].set_ylabel(f"value over that at $N={largest}$")
-    grid[0].xaxis.set_major_locator(FixedLocator(data.grains.values.tolist(), nbins=4))
+    sizes = data.grains.values.tolist()
+    grid[0].set_ylabel(f"value over that at $N={sizes[-1]}$")
+    grid[0].xaxis.set_major_locator(FixedLocator(sizes, nbins=4))
     grid[0].xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     grid[0].xaxis.set_minor_locator(NullLocator())
-    labels, title = _names(data, together=True)
-    add_curve_legend(figure, labels, title, suspect(data).any())
+    _add_legend(figure, data)
     message = (
         "How averages depend on the number of grains. Bars are standard errors of each value, also "
         "of that at the largest $N$"
@@ -130,52 +102,54 @@ def averages_against_grains(data: MapData) -> Figure:
     return figure
 
 
-def _require_several(data: MapData, name: str, words: str) -> xr.Dataset:
-    """Return a map, flattened; raise an InputError unless it has several values of a dimension."""
-    flat = require_map(data, *RATIO)
-    count = flat.sizes.get(name, 1)
-    if count < 2:
-        raise InputError(f"this figure needs at least two {words}, and this map has {count}.")
-    return flat
-
-
-def _thinned(data: xr.Dataset, alphas: int, nus: int) -> tuple[xr.Dataset, str]:
-    """Return a map of at most so many restitutions and packing fractions, evenly chosen, and a
-    sentence that tells of what there were more.
+def _several_of(data: MapData, along: str, words: str) -> tuple[xr.Dataset, str]:
+    """Return a map of at most six flows with several values of a dimension, and a sentence that
+    tells of what there were more.
     """
-    most = {"restitution": alphas, "packing_fraction": nus}
-    left = {name: count for name, count in most.items() if data.sizes[name] > count}
-    chosen = {
-        name: np.linspace(0, data.sizes[name] - 1, count).round().astype(int)
-        for name, count in left.items()
+    flat = require_map(data, *RATIO)
+    if flat.sizes.get(along, 1) < 2:
+        raise InputError(
+            f"this figure needs at least two {words}, and this map has {flat.sizes.get(along, 1)}."
+        )
+    alphas, nus = flat.sizes["restitution"], flat.sizes["packing_fraction"]
+    most_alphas = min(alphas, max(_MOST_ALPHAS, MOST_CURVES // nus))
+    counts = {
+        "restitution": (alphas, most_alphas),
+        "packing_fraction": (nus, MOST_CURVES // most_alphas),
     }
-    words = [
-        f"{count} of {data.sizes[name]} {name.replace('_', ' ')}s" for name, count in left.items()
-    ]
-    return data.isel(chosen), f"Shown: {', '.join(words)}" if words else ""
+    more = {name: (count, most) for name, (count, most) in counts.items() if count > most}
+    chosen = {
+        name: np.linspace(0, count - 1, most).round().astype(int)
+        for name, (count, most) in more.items()
+    }
+    left = ", ".join(f"{m} of {n} {name.replace('_', ' ')}s" for name, (n, m) in more.items())
+    names = [name for name in _QUANTITIES if name in flat]
+    shown = selection(data, *names, along=along).isel(chosen)
+    return shown, f"Shown: {left}" if left else ""
 
 
 def _flows(data: xr.Dataset) -> list[xr.Dataset]:
-    """Return the curves of a panel, by packing fraction and restitution."""
+    """Return the flows of a map, by packing fraction and restitution."""
     nus, alphas = range(data.sizes["packing_fraction"]), range(data.sizes["restitution"])
     return [data.isel(packing_fraction=k, restitution=j) for k in nus for j in alphas]
 
 
-def _names(panel: xr.Dataset, together: bool) -> tuple[list[str], str]:
-    """Return the names of the curves of a panel and the title of their legend."""
-    points = [(flow.restitution.item(), flow.packing_fraction.item()) for flow in _flows(panel)]
-    if together:
-        return [f"{alpha:.4g}, {nu:.4g}" for alpha, nu in points], r"$\alpha$, $\nu$"
-    return [f"{alpha:.4g}" for alpha, _ in points], ALPHA_TITLE
+def _add_legend(figure: Figure, data: xr.Dataset) -> None:
+    """Name the curves by α and ν."""
+    names = [
+        f"{flow.restitution.item():.4g}, {flow.packing_fraction.item():.4g}"
+        for flow in _flows(data)
+    ]
+    add_curve_legend(figure, names, r"$\alpha$, $\nu$", suspect(data).any())
 
 
 def _draw_curves(
-    axes: Axes, panel: xr.Dataset, along: str, name: str, relative: bool = False
+    axes: Axes, data: xr.Dataset, along: str, name: str, relative: bool = False
 ) -> None:
     """Draw a quantity of all flows along a dimension, or its quotient with the last value."""
     draw_reference(axes)
     axes.set_xscale("log")
-    flows, x = _flows(panel), panel[along].values
+    flows, x = _flows(data), data[along].values
     for k, (flow, style) in enumerate(zip(flows, curve_styles(len(flows)), strict=True)):
         value, error = flow[name].values, flow[f"{name}_stderr"].values
         unit = abs(value[-1]) if relative else 1.0

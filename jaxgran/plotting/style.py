@@ -6,7 +6,6 @@ No plotting state remains changed, and no display is needed.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
 from functools import wraps
 from io import BytesIO
@@ -29,10 +28,7 @@ from matplotlib.ticker import (
 )
 
 from jaxgran.files import atomic_write
-from jaxgran.model.checks import InputError, short_repr
 
-# bytes of a stem; file systems accept 255, and the names of figures are longer than their stem
-LONGEST_NAME = 200
 ONE_COLUMN, TWO_COLUMNS = 8.5 / 2.54, 17 / 2.54  # inches, width of a figure
 FILE_DPI = 200  # dots per inch of a picture, unless another number is given
 LABEL_SIZE = 8.0  # points, font of titles and of the labels of axes
@@ -135,28 +131,6 @@ def add_caption(figure: Figure, sentences: Iterable[str]) -> None:
     caption = figure.supxlabel(f"{text}.", x=0.01, **style)
     height = caption.get_window_extent().height / figure.dpi
     figure.set_figheight(figure.get_figheight() + height)
-
-
-def writable_stem(stem: Path | str) -> Path:
-    """Return folder and beginning of the names of figures; raise an InputError if no file can be
-    written there.
-    """
-    if not isinstance(stem, (str, os.PathLike)):
-        raise InputError(
-            f"stem must be folder and beginning of the file names, not {short_repr(stem)}."
-        )
-    stem = Path(stem)
-    if len(os.fsencode(stem.name)) > LONGEST_NAME:
-        raise InputError(
-            f"the names of figures must begin with at most {LONGEST_NAME} bytes, not "
-            f"{short_repr(stem.name)}."
-        )
-    if not os.path.isdir(stem.parent) or not os.access(stem.parent, os.W_OK):
-        raise InputError(
-            "figures must be written to a folder that can be written to, not "
-            f"{short_repr(str(stem.parent))}."
-        )
-    return stem
 
 
 @styled
