@@ -81,11 +81,19 @@ def enskog_factors(data: MapData) -> Figure:
     _label_ends(grid[-1], ends)
     if suspect(data.isel(restitution=chosen)).any():
         figure.legend(handles=[Line2D([], [], **RING)], loc="outside upper left")
+    shown = data.isel(restitution=chosen)
+    logs = np.log(
+        [shown[f"{PREFIX}{name}"].where(shown[f"{PREFIX}{name}"] > 0) for name in FACTORS]
+    )
+    right, all_right = (
+        (abs(np.expm1(log)) <= 0.1).sum() for log in (logs.sum(axis=0), abs(logs).max(axis=0))
+    )
     describe(
         figure,
         data,
-        "Correlated velocities (molecular chaos) and more pairs at contact largely compensate each "
-        "other. Factors of Enskog's contact pressure, one an assumption, and their product (thick)",
+        f"Enskog's contact pressure is right within 10 % at {right} of {logs[0].size} points, each "
+        f"of its assumptions at {all_right}{': errors cancel' if right > all_right else ''}",
+        "Each factor replaces one more assumption by what is measured; thick: their product",
     )
     return figure
 
