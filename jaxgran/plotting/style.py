@@ -224,7 +224,7 @@ def label_log_axis(axis: Axis, most: int = 9) -> None:
 def draw_reference(axes: Axes) -> None:
     """Draw the line of value 1; it has a number at the axis."""
     axes.axhline(1.0, color="0.6", linewidth=0.8, zorder=0)
-    axes.yaxis.set_major_locator(MaxNLocator(5, steps=_ROUND_STEPS))
+    axes.yaxis.set_major_locator(MaxNLocator(7, steps=_ROUND_STEPS))
 
 
 def scientific(value: float) -> str:
