@@ -157,7 +157,7 @@ def judge_error(output: Output, error: float) -> None:
             maps.append(jg.ratio_map(*ERROR_PLANE, **given, first_seed=ERROR_SEEDS * repeat))
         print(f"repeat {repeat + 1} of {count}: {time.perf_counter() - start:.0f} s", flush=True)
     strain = np.stack([one["sums/strain"].sum("seed") for one in maps])
-    limited = np.mean([one["sums/status"] == Status.strain_limit for one in maps])
+    limited = np.mean([one["sums/status"] == Status.imprecise for one in maps])
     rows = []
     for name in ERROR_OBSERVABLES:
         values, errors = (

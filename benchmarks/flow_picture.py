@@ -18,8 +18,7 @@ from matplotlib.patches import Patch
 
 import jaxgran as jg
 from benchmarks.output import Output
-from jaxgran.analysis.force_chains import cluster_share, clusters
-from jaxgran.analysis.instant import Instant
+from jaxgran.analysis.contacts import ForceNetwork, cluster_share, clusters
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.plotting.flow import (
     Colour,
@@ -99,7 +98,7 @@ def summary(restitution: float, snapshots: Snapshot) -> dict[str, float]:
 
 
 @styled
-def draw(networks: list[Instant], colour: Colour) -> Figure:
+def draw(networks: list[ForceNetwork], colour: Colour) -> Figure:
     """The flows beside each other, each in its own scale."""
     figure = empty_figure(TWO_COLUMNS, 3.1)
     handles: list[Patch] = []

@@ -27,11 +27,11 @@ import numpy as np
 from benchmarks.output import RESULTS, ROOT
 from benchmarks.peers import front
 from benchmarks.solvers.groups import GROUPS
+from jaxgran.maps.automatic import chosen_settings
 from jaxgran.maps.results import open_map
 from jaxgran.maps.schema import shear_stress_ratio
 from jaxgran.model.display import with_error
 from jaxgran.reference.table import FACTORS
-from jaxgran.sampling.budget import fewest_grains
 
 TEMPLATES = {
     "README.md": "docs/_build/README.md",
@@ -144,6 +144,21 @@ def shear_stress_ratio_at(
     chosen = {"restitution": restitution, "packing_fraction": packing_fraction}
     value, error = (float(one.sel(chosen)) for one in shear_stress_ratio(_map(file)))
     return value, error
+
+
+def grains_for(error: float, restitution: float, packing_fraction: float) -> int:
+    """The number of grains that ``--error`` chooses for a flow with one seed."""
+    settings, _ = chosen_settings(
+        {
+            "restitution": restitution,
+            "packing_fraction": packing_fraction,
+            "error": error,
+            "seeds": 1,
+            "grains": "auto",
+            "timestep": "auto",
+        }
+    )
+    return settings.sizes[-1]
 
 
 def percent_pm(value_and_error: Iterable[float]) -> str:
@@ -268,9 +283,9 @@ def output_of_where(restitution: float, packing_fraction: float) -> str:
         check=True,
         env=environment,
     )
-    verdict, rest = done.stdout.split("\n", 1)
-    lines = [line.rstrip() for line in rest.split("Enskog's contact pressure")[0].splitlines()]
-    return "\n".join([textwrap.fill(verdict, 110), "", *filter(None, lines)])
+    verdict, table = done.stdout.split("Reference map")[0].split("α = ")
+    lines = [line.rstrip() for line in f"α = {table}".splitlines()]
+    return "\n".join([textwrap.fill(" ".join(verdict.split()), 100), "", *filter(None, lines)])
 
 
 ENVIRONMENT = jinja2.Environment(
@@ -290,7 +305,7 @@ ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table, "SOLVE
 for _functions in (
     (abs, max, at, found, flows_of, point, quotients, over, rms, ranked),
     (sig, percent, percent_pm, pm, duration, signed),
-    (fewest_grains, shear_stress_ratio_at),
+    (grains_for, shear_stress_ratio_at),
     (
         peers_ratio,
         output_of_where,

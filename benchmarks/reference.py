@@ -48,7 +48,7 @@ from jaxgran.reference.table import (
     theory_of,
     write_columns,
 )
-from jaxgran.sampling.budget import SIZE_LAWS, SIZE_SPREAD, jamming_error
+from jaxgran.sampling.budget import SIZE_LAWS
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.navier_stokes import garzo_dufty
 
@@ -109,32 +109,17 @@ def make_table(
     paths[LENGTH] = f"theory/{LENGTH}"
     for name, path in paths.items():
         columns |= {name: flat[path].values, f"{name}_stderr": flat[f"{path}_stderr"].values}
-        bounded = BOUNDED_BY.get(name, name)
-        if f"{bounded}_ci95" in flat:
-            sources = ["timestep", "tolerance", *(["size"] if name == RATIO else [])]
-            bound = np.sqrt(
-                (flat[f"{bounded}_ci95"].sel(error_source=sources) ** 2).sum("error_source").values
-            )
-            columns[f"{name}_bound"] = bound * columns[name] / flat[bounded].values
-        if name in MEASURED:
-            missing = SIZE_LAWS[bounded].missing(*where)
-            of_size = np.hypot(SIZE_SPREAD * missing, jamming_error(*where[1:])) * columns[name]
-            columns[f"{name}_bound"] = np.hypot(columns[f"{name}_bound"], of_size)
-            columns |= {
-                f"{name}{end}": columns[f"{name}{end}"] / (1 - missing)
-                for end in ("", "_stderr", "_bound")
-            }
+        if name in (*MEASURED, RATIO):
+            columns |= of_large_system(flat, name, path)
     for other in others:
         name = f"{RATIO}_at_{float(other.attrs['timestep']):g}"
         plane = {axis: data[axis].values for axis in ("packing_fraction", "restitution")}
-        ratios = flattened(other)[[RATIO, f"{RATIO}_stderr"]].reindex(
+        near = flattened(other)[[*_columns(RATIO), f"{RATIO}_stderr"]].reindex(
             plane, method="nearest", tolerance=1e-6
         )
-        at_points = ratios.stack(point=("packing_fraction", "restitution")).isel(point=finite)
-        columns |= {
-            name: at_points[RATIO].values,
-            f"{name}_stderr": at_points[f"{RATIO}_stderr"].values,
-        }
+        at_points = near.stack(point=("packing_fraction", "restitution")).isel(point=finite)
+        ratio = of_large_system(at_points, RATIO, RATIO)
+        columns |= {name: ratio[RATIO], f"{name}_stderr": ratio[f"{RATIO}_stderr"]}
         paths[name] = RATIO
     theory, within = best_theory(columns)
     series = chebyshev_series(theory, columns)
@@ -177,6 +162,25 @@ def make_table(
             f"{x:.5g}" for x in (shape.amplitude, *shape.lengths, shape.noise, shape.leave_one_out)
         )
     write_columns(folder / "averages.csv", head, columns)
+
+
+def of_large_system(flat: xr.Dataset, name: str, path: str) -> dict[str, np.ndarray]:
+    """An average of a large system, its standard error, and the bound of all other errors."""
+    bounded = BOUNDED_BY.get(name, name)
+    large, errors = (flat[x] for x in _columns(bounded))
+    slope = errors.sel(error_source="sampling") / (HALF_INTERVAL * flat[f"{bounded}_stderr"])
+    value = large if name == RATIO else flat[path] * slope
+    bounds = errors.sel(error_source=["timestep", "size", "tolerance"])
+    bound = np.sqrt((bounds**2).sum("error_source")) * value / large
+    return {
+        name: value.values,
+        f"{name}_stderr": (flat[f"{path}_stderr"] * slope).values,
+        f"{name}_bound": bound.values,
+    }
+
+
+def _columns(average: str) -> tuple[str, str]:
+    return f"{average}_large_system", f"{average}_large_system_ci95"
 
 
 def best_theory(columns: dict[str, np.ndarray]) -> tuple[Callable, dict[str, float]]:

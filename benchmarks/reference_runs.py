@@ -70,7 +70,9 @@ def _row(data: xr.DataTree) -> dict[str, float]:
     for name in OBSERVABLES:
         row |= {name: _short(point[name]), f"{name}_stderr": _short(point[f"{name}_stderr"])}
         for source in ("timestep", "tolerance"):
-            row[f"{name}_{source}"] = _short(point[f"{name}_ci95"].sel(error_source=source))
+            row[f"{name}_{source}"] = _short(
+                point[f"{name}_large_system_ci95"].sel(error_source=source)
+            )
     rate = "stresses/dissipation_rate"
     return row | {
         "dissipation_rate": _short(point[rate]),

@@ -9,18 +9,20 @@ Then all flows share one law of the missing part of an average,
     x(N) = x∞ [1 − (a + b (1 − α)) exp(m (ν − 0.5)) w(ν) (N/1600)^(−s)],        w = min(1, (ν_w −
     ν)/0.1),
 
-where w ends the waves towards jamming. A flow of 102,400 grains (``reference_map --part large``) is
-a test, not fitted. Standard errors are larger by the root of the reduced χ², as a profile of
+where w ends the waves towards jamming. Not fitted, and so tests, are a flow of 102,400 grains
+(``reference_map --part large``) and sixteen flows of 256, 1024 and 25,600 grains (``--part
+check``). Standard errors are larger by the root of the reduced χ², as a profile of
 velocity that lasts longer than a sample is not in those of the flows.
 
     python -m benchmarks size_limits   # a second
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import xarray as xr
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.stats import chi2
 
@@ -28,9 +30,9 @@ import jaxgran as jg
 from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.sampling.budget import SIZE_SPREAD, SizeLaw
+from jaxgran.sampling.budget import SIZE_LAWS, SizeLaw, jamming_error
 
-AVERAGES = ("pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
+AVERAGES = tuple(SIZE_LAWS)
 LAWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "N^(-1/3)": lambda grains: grains ** (-1 / 3),
     "N^(-1/2)": lambda grains: grains**-0.5,
@@ -59,23 +61,29 @@ def run(output: Output) -> None:
         *rows_of_maps("sizes_loose", "sizes_dense"),
     ]
     (large,) = rows_of_maps("large")
-    laws, limits, tests = {}, [], []
+    laws, limits, tests, checks = {}, [], [], []
     for average in AVERAGES:
         flows = flows_of(rows, average)
         loose = [flow for flow in flows if flow.packing_fraction <= LARGEST_FRACTION]
-        laws[average] = {"exponents": exponents(loose), "law": law_of(flows)}
+        laws[average] = {
+            "exponents": exponents(loose),
+            "law": law_of(flows, SIZE_LAWS[average].spread),
+        }
         tests.append(
             {"average": average, **compared_with_larger(large, flows, average, laws[average])}
+        )
+        checks += list(
+            checked(average, SizeLaw(*laws[average]["law"]["constants"], SIZE_LAWS[average].spread))
         )
         limits += [
             {"average": average, **one}
             for one in limits_of(loose, laws[average]["exponents"]["interval"])
         ]
         print(average, rounded(laws[average], 4))
-        print(rounded(tests[-1], 4))
+        print(rounded([tests[-1], *checks[-2:]], 4))
     output.write_rows(
         "size_limits",
-        {"laws": rounded(laws, 5), "tests": rounded(tests, 5)},
+        {"laws": rounded(laws, 5), "tests": rounded(tests, 5), "checks": rounded(checks, 4)},
         "rows",
         rounded(limits, 5),
     )
@@ -188,9 +196,8 @@ def compared_with_larger(
         limit, amplitude, *_ = fitted(flow, flow.grains**-s)
         large, largest = limit - amplitude * grains**-s
         ends.append(large / largest - 1)
-    large, largest = 1 - SizeLaw(*laws["law"]["constants"]).missing(
-        flow.restitution, flow.packing_fraction, grains
-    )
+    constants = laws["law"]["constants"]
+    large, largest = 1 - missing_part(constants, flow._replace(grains=grains))
     return {
         "grains": [int(n) for n in grains],
         "measured": [ratio - 1, spread],
@@ -199,12 +206,46 @@ def compared_with_larger(
     }
 
 
-def missing_part(constants: np.ndarray, flow: Flow) -> np.ndarray:
+def checked(average: str, law: SizeLaw) -> Iterator[dict[str, Any]]:
+    """How flows that the law was not fitted to agree with those of 25,600 grains, for each smaller
+    N: root mean squares as they are, corrected, and of sampling; the share within the 95 % interval
+    of the correction, and its half-width (rms).
+    """
+    small, large = (
+        jg.open_map(RESULTS / f"reference_check_{name}.nc").to_dataset()
+        for name in ("small", "large")
+    )
+    flows = small.restitution, small.packing_fraction
+    values, errors = large[average], large[f"{average}_stderr"] / large[average]
+    most_missing = law.missing(*xr.broadcast(*flows), large.grains.item())
+    for grains in small.grains.values.tolist():
+        smaller = small.sel(grains=grains)
+        missing = law.missing(*xr.broadcast(*flows), grains)
+        ratio = (smaller[average] / values).transpose("restitution", ...).values
+        noise = np.hypot(smaller[f"{average}_stderr"] / smaller[average], errors)
+        noise = noise.transpose("restitution", ...).values
+        apart = np.log(ratio) - np.log1p(-missing) + np.log1p(-most_missing)
+        waves = law.spread * (missing - most_missing) / (1 - missing)
+        jamming = jamming_error(small.packing_fraction.values, grains)
+        half = np.sqrt(waves**2 + jamming**2 + (HALF_INTERVAL * noise) ** 2)
+        rms = {"as_it_is": np.log(ratio), "corrected": apart, "sampling": noise, "half_width": half}
+        yield {
+            "average": average,
+            "grains": grains,
+            "flows": apart.size,
+            **{name: float(np.sqrt(np.mean(x**2))) for name, x in rms.items()},
+            "within": float(np.mean(abs(apart) < half)),
+        }
+
+
+def missing_part(constants: Sequence[float], flow: Flow) -> np.ndarray:
     """The missing part of an average over its limit, at every N of a flow."""
-    return SizeLaw(*constants).missing(flow.restitution, flow.packing_fraction, flow.grains)
+    return SizeLaw(*constants, spread=0.0).missing(
+        flow.restitution, flow.packing_fraction, flow.grains
+    )
 
 
-def law_of(flows: list[Flow]) -> dict[str, Any]:
+def law_of(flows: list[Flow], spread: float) -> dict[str, Any]:
     """The constants of the law that all flows share, their standard errors and correlations, and
     χ².
     """
@@ -232,11 +273,11 @@ def law_of(flows: list[Flow]) -> dict[str, Any]:
         "chi_squared": 2 * best.cost,
         "freedom": freedom,
         "differences": sum(len(flow.grains) - 1 for flow in flows),
-        "within": float(np.mean(np.concatenate([within(best.x, flow) for flow in flows]))),
+        "within": float(np.mean(np.concatenate([within(best.x, flow, spread) for flow in flows]))),
     }
 
 
-def within(constants: np.ndarray, flow: Flow) -> np.ndarray:
+def within(constants: np.ndarray, flow: Flow, spread: float) -> np.ndarray:
     """Whether the value at each N over that at the largest is what the law says, within 95 %
     intervals.
 
@@ -246,6 +287,6 @@ def within(constants: np.ndarray, flow: Flow) -> np.ndarray:
     missing, relative = missing_part(constants, flow), flow.stderrs / flow.values
     apart = np.log(flow.values / flow.values[-1]) - np.log1p(-missing) + np.log1p(-missing[-1])
     half = np.hypot(
-        HALF_INTERVAL * np.hypot(relative, relative[-1]), SIZE_SPREAD * (missing - missing[-1])
+        HALF_INTERVAL * np.hypot(relative, relative[-1]), spread * (missing - missing[-1])
     )
     return (abs(apart) < half)[:-1]

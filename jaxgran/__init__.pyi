@@ -1,6 +1,5 @@
 """The public names of jaxgran and where they live; they load when they are first used."""
 
-from .analysis.coarse_graining import gaussian
 from .analysis.fields import fields_at, grid
 from .analysis.fit import fit_trajectory
 from .analysis.jax_md_space import jax_md_space
@@ -70,7 +69,6 @@ __all__ = [
     "fields_at",
     "fit_trajectory",
     "flow_figure",
-    "gaussian",
     "grid",
     "heated",
     "jax_md_space",

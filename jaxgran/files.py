@@ -16,7 +16,7 @@ try:
 except ImportError:  # a system without file locks: every process writes the file
     fcntl = None
 
-_DIGEST = 32  # bytes at the start of a cache file: the SHA-256 hash of the rest
+_DIGEST = hashlib.sha256().digest_size  # bytes
 
 
 @contextmanager
@@ -45,90 +45,83 @@ def file_lock(path: Path) -> Iterator[None]:
     """Let one process at a time enter the block for a file; the lock is released even if the
     process dies.
     """
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    name = path.with_suffix(".lock")
-    while True:
-        try:
-            lock = name.open("w")
-        except OSError:  # the folder is not writable, so there will be no file to wait for
-            yield
-            return
-        with lock:
-            if fcntl is not None:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-                if not same_file(
-                    lock.fileno(), name
-                ):  # its owner has removed it: lock the one that is there now
-                    continue
-            try:
-                yield
-            finally:
-                with suppress(OSError):
-                    name.unlink()
-            return
+    lock, handle = path.with_suffix(".lock"), None
+    with suppress(OSError):  # the folder is not writable, so there will be no file to wait for
+        handle = lock_file(lock, wait=True)
+    try:
+        yield
+    finally:
+        if handle is not None:
+            with suppress(OSError):
+                lock.unlink()
+            os.close(handle)
 
 
-def lock_folder(folder: Path) -> int | None:
-    """Lock a folder, made if missing, until this process ends; the handle of its file ``lock``.
+def lock_file(path: Path, wait: bool) -> int | None:
+    """Lock a file, made with its folder if missing, until the handle is closed or this process
+    ends.
 
     On a system without locks there is no handle, and no other process is noticed.
 
     Raises:
-      FileExistsError: a file has the name of the folder.
-      BlockingIOError: another process has locked it.
+      BlockingIOError: another process has locked it, and ``wait`` is False.
+      OSError: the file cannot be made.
     """
     while True:
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         if fcntl is None:
             return None
         try:
-            handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         except FileNotFoundError:  # another process has just finished and removed the folder
             continue
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(handle)
             raise
         except OSError:  # a file system without locks
             return handle
-        if is_lock_of(folder, handle):
+        if is_locked(path, handle):
             return handle
-        os.close(handle)  # the lock of a removed folder: try again
+        os.close(handle)  # the lock of a removed file: try again
 
 
-def is_lock_of(folder: Path, lock: int | None) -> bool:
-    """Whether a lock is that of this folder, and not of one that was removed since."""
-    return lock is None or same_file(lock, folder / "lock")
-
-
-def same_file(handle: int, path: Path) -> bool:
-    """Whether an open file is the one that has this name now, and not one that was removed
+def is_locked(path: Path, handle: int | None) -> bool:
+    """Whether a handle of ``lock_file`` is that of this file, and not of one that was removed
     since.
     """
     try:
-        return os.path.samestat(os.fstat(handle), path.stat())
+        return handle is None or os.path.samestat(os.fstat(handle), path.stat())
     except OSError:
         return False
+
+
+def with_checksum(content: bytes) -> bytes:
+    """The content, followed by its SHA-256 checksum."""
+    return content + hashlib.sha256(content).digest()
+
+
+def without_checksum(content: bytes) -> bytes | None:
+    """The content before its checksum; None if that is not its own."""
+    whole = content[:-_DIGEST]
+    return whole if with_checksum(whole) == content else None
 
 
 def read_cached(path: Path) -> bytes | None:
     """The content of a cache file; None if it is missing or damaged."""
     with suppress(OSError):
-        content = path.read_bytes()
-        if hashlib.sha256(content[_DIGEST:]).digest() == content[:_DIGEST]:
-            return content[_DIGEST:]
+        return without_checksum(path.read_bytes())
     return None
 
 
-def other_version(name: str, found: object, version: int | str) -> str:
+def other_version(name: str, stored: object, version: int | str) -> str:
     """A sentence if a file has another ``format_version`` than this version of jaxgran reads; "" if
     it has the same.
     """
-    if found == version:
+    if stored == version:
         return ""
-    has = "no format_version" if found is None else f"format_version {found}"
+    has = "no format_version" if stored is None else f"format_version {stored}"
     return f"{name} has {has}, and this version of jaxgran reads format_version {version}."
 
 
@@ -140,7 +133,7 @@ def write_cached(path: Path, content: bytes, most: int) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
-        temporary.write_bytes(hashlib.sha256(content).digest() + content)
+        temporary.write_bytes(with_checksum(content))
     with suppress(OSError):
         newest_first = sorted(
             path.parent.glob(f"*{path.suffix}"), key=lambda x: x.stat().st_mtime, reverse=True

@@ -28,7 +28,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxgran as jg
-from jaxgran.analysis.force_chains import cluster_share, clusters
+from jaxgran.analysis.contacts import cluster_share, clusters
 from jaxgran.model.display import with_error
 from jaxgran.sampling.averages import averages
 

@@ -45,11 +45,12 @@ def jaxgran(folder: Path, *arguments: str) -> Outcome:
         pytest.raises(SystemExit) as end,
     ):
         patch.chdir(folder)
+        patch.setenv("COLUMNS", "200")
         patch.setattr(sys, "argv", ["jaxgran", *arguments])
         patch.setattr(typer.main, "get_command", commands)
         for module in (info, measure, merge, run):
             patch.setattr(module, "configured_jax", lambda: jax)
-        app.main()
+        app.app(prog_name="jaxgran")
     return Outcome(end.value.code or 0, out.getvalue(), err.getvalue())
 
 
@@ -89,7 +90,11 @@ def write_few_variables(patch: pytest.MonkeyPatch, *more: str) -> None:
     second or two.
     """
     whole, names = results.write_dataset, ("force_ratio", "stress_ratio", *more)
-    kept = {f"{name}{end}" for name in names for end in ("", "_stderr", "_ci95")}
+    kept = {
+        f"{name}{end}"
+        for name in names
+        for end in ("", "_stderr", "_large_system", "_large_system_ci95")
+    }
     kept |= {"status", "sums/status", "sums/strain"}
     patch.setattr(
         results, "write_dataset", lambda data, path: whole(with_variables(data, *kept), path)
@@ -103,6 +108,7 @@ def files(folder: Path) -> set[str]:
 def assert_one_sentence(outcome: Outcome) -> None:
     assert outcome.status == 2
     assert outcome.out == ""
-    assert outcome.err.startswith("jaxgran: ")
-    assert outcome.err.endswith(".\n")
-    assert outcome.err.count("\n") == 1
+    sentence = outcome.err.rpartition("\n\n")[2]  # Typer names the help before its sentence
+    assert sentence.startswith(("Error: ", "jaxgran: "))
+    assert sentence.endswith((".\n", ")\n", "?\n"))
+    assert sentence.count("\n") == 1

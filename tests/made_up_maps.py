@@ -30,7 +30,7 @@ def ratio_dataset(alphas: int = 5, nus: int = 6, relative_error: float = 0.05) -
         },
         coords={"packing_fraction": nu, "restitution": alpha},
         attrs={
-            "format_version": 4,
+            "format_version": 5,
             "timestep": 3e-4,
             "activation": "midpoint",
             "grains": 256,

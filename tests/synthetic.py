@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from jaxgran.analysis.instant import Instant
+from jaxgran.analysis.contacts import ForceNetwork
 from jaxgran.contact.network import Contacts
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.dynamics.tally import TABLE, Tally
@@ -59,12 +59,12 @@ def random_replica(
     return Replica(Sample(tally, np.float64(100.0), np.float64(1.0), grains), int(status), 3.0)
 
 
-def random_instant(seed: int, grains: int = 20, pairs: int = 7) -> Instant:
+def random_instant(seed: int, grains: int = 20, pairs: int = 7) -> ForceNetwork:
     """Return an instant of grains at random places in a cell of side 10, with pairs of random
     forces.
     """
     rng = np.random.default_rng(seed)
-    return Instant(
+    return ForceNetwork(
         positions=rng.uniform(-5, 5, (grains, 2)),
         radii=rng.uniform(0.3, 0.7, grains),
         speed=rng.gamma(2.0, 1.0, grains),

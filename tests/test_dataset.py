@@ -17,7 +17,7 @@ from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.variables import VARIABLES
 from jaxgran.model.status import Status
-from jaxgran.sampling.budget import error_budget, size_error
+from jaxgran.sampling.budget import large_system, size_error
 from jaxgran.sampling.enskog_factors import FACTORS, LENGTHS, measured_over_enskog
 from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.sample import BLOCKS
@@ -84,7 +84,7 @@ def test_a_file_of_another_format_is_refused_in_a_sentence(
     if version is not None:
         other.attrs["format_version"] = version
     write_dataset(other, tmp_path / "map.nc")
-    with refused("and this version of jaxgran reads format_version 4"):
+    with refused("and this version of jaxgran reads format_version 5"):
         open_map(tmp_path / "map.nc")
 
 
@@ -208,7 +208,12 @@ def test_a_jammed_point_has_no_value(settings, results) -> None:
     }
     point = map_dataset(settings, jammed, RUN).sel(packing_fraction=NUS[0], restitution=ALPHAS[1])
     assert point.status == Status.infeasible
-    for name in ("force_ratio", "pressure_stderr", "pressure_ci95", "stresses/contact_stress"):
+    for name in (
+        "force_ratio",
+        "pressure_stderr",
+        "pressure_large_system_ci95",
+        "stresses/contact_stress",
+    ):
         assert np.isnan(point[name]).all()
 
 
@@ -285,7 +290,7 @@ def test_errors_of_a_point_are_those_of_its_own_flow(settings, data) -> None:
             }
             errors = {name: numbers.get(f"{name}_stderr", np.nan) for name in numbers}
             numbers["contact_stress"] = point["stresses/contact_stress"].values
-            budget = error_budget(
+            estimates = large_system(
                 numbers,
                 errors,
                 alpha,
@@ -294,14 +299,13 @@ def test_errors_of_a_point_are_those_of_its_own_flow(settings, data) -> None:
                 settings.timestep,
                 settings.solver.tolerance,
             )
-            for name, parts in budget.items():
-                for part in ("timestep", "size", "tolerance"):
-                    stored = float(point[f"{name}_ci95"].sel(error_source=part))
-                    assert stored == pytest.approx(float(parts[part]), nan_ok=True)
-                total, *others = point[f"{name}_ci95"].values
-                assert total == pytest.approx(float(parts["total"]), nan_ok=True)
-                assert total == pytest.approx(np.sqrt(np.sum(np.square(others))), nan_ok=True)
-                assert f"{name}_ci95" in data[name].attrs["ancillary_variables"].split()
+            for name, estimate in estimates.items():
+                path = f"{name}_large_system"
+                assert float(point[path]) == pytest.approx(float(estimate.value), nan_ok=True)
+                for source, half_width in list(estimate._asdict().items())[1:]:
+                    stored = float(point[f"{path}_ci95"].sel(error_source=source))
+                    assert stored == pytest.approx(float(half_width), nan_ok=True)
+                assert f"{path}_ci95" in data[path].attrs["ancillary_variables"].split()
 
 
 def test_grains_chosen_by_point_are_in_the_file_and_change_the_error(tmp_path: Path) -> None:
@@ -323,10 +327,9 @@ def test_grains_chosen_by_point_are_in_the_file_and_change_the_error(tmp_path: P
     for k, grains in enumerate((64, 256, 256, 1024)):
         alpha, nu = ALPHAS[k % 2], NUS[k // 2]
         point = data.sel(packing_fraction=nu, restitution=alpha)
-        size = float(size_error(alpha, nu, grains))
-        expected = size / (1 - size)
         assert float(
-            point.pressure_ci95.sel(error_source="size") / abs(point.pressure)
-        ) == pytest.approx(expected)
+            point.pressure_large_system_ci95.sel(error_source="size")
+            / abs(point.pressure_large_system)
+        ) == pytest.approx(float(size_error(alpha, nu, grains)))
     write_dataset(with_variables(data, *FEW), tmp_path / "map.nc")
     assert MapSettings(**from_attrs(open_map(tmp_path / "map.nc"))) == chosen

@@ -12,7 +12,7 @@ import pytest
 from synthetic import random_tally
 
 from jaxgran.dynamics.batch import stack
-from jaxgran.io.atomic import CorruptFile
+from jaxgran.io.arrays import CorruptFile
 from jaxgran.maps import journal as journal_module
 from jaxgran.maps.journal import Journal
 from jaxgran.model.flow import ShearFlow
@@ -67,10 +67,10 @@ def whole() -> Any:
 def test_a_batch_that_is_cut_off_goes_on_to_the_same_bits(whole, cuts, tmp_path: Path) -> None:
     for calls in cuts:
         try:
-            measured(Journal(tmp_path / "batch.nc", KEYS, cut_after(advance_batch, calls)))
+            measured(Journal(tmp_path / "batch.npz", KEYS, cut_after(advance_batch, calls)))
         except CutOff:
             continue
-    resumed = measured(Journal(tmp_path / "batch.nc", KEYS, advance_batch))
+    resumed = measured(Journal(tmp_path / "batch.npz", KEYS, advance_batch))
     jax.tree.map(np.testing.assert_array_equal, resumed, whole)
 
 
@@ -98,7 +98,7 @@ def walk(advance, calls: int) -> list:
 
 @pytest.mark.usefixtures("after_every_call")
 def test_nothing_is_done_twice(tmp_path: Path) -> None:
-    path, done = tmp_path / "batch.nc", []
+    path, done = tmp_path / "batch.npz", []
 
     def counted(*arguments):
         done.append(arguments)
@@ -112,7 +112,7 @@ def test_nothing_is_done_twice(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("after_every_call")
 def test_the_journal_of_others_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "batch.nc"
+    path = tmp_path / "batch.npz"
     walk(Journal(path, KEYS, fake_drive), 3)
     with pytest.raises(CorruptFile, match="another batch"):
         Journal(path, [(0, 0), (2, 0)], fake_drive)

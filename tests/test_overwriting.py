@@ -20,7 +20,7 @@ from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.results import open_map
 from jaxgran.model.status import Status
 from jaxgran.plotting.theory import CLUSTERS
-from jaxgran.sampling.budget import BUDGET
+from jaxgran.sampling.budget import LARGE_SYSTEM
 
 MAP = ("map", *POINTS, "--seeds", "1")
 BOTH = {(0, 0): Status.ok, (1, 0): Status.ok}
@@ -32,7 +32,7 @@ def made_up_maps(patch: pytest.MonkeyPatch) -> None:
     Their own files have what is printed and what decides which pictures there are.
     """
     write_without_drawing(patch)
-    write_few_variables(patch, *BUDGET, *CLUSTERS)
+    write_few_variables(patch, *LARGE_SYSTEM, *CLUSTERS)
     patch.setattr(ratio_map_module, "run_replicas", made_up_replicas(BOTH))
 
 
@@ -112,7 +112,7 @@ def test_an_interrupted_map_does_not_replace_a_finished_one(
         )
         assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
         unfinished = tmp_path / "jaxgran_map.nc.unfinished"
-        assert len(list(unfinished.glob("replica-*.nc"))) == 1
+        assert len(list(unfinished.glob("replica-*.npz"))) == 1
         for path in unfinished.iterdir():
             path.unlink()
         unfinished.rmdir()

@@ -66,13 +66,15 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
             assert_same_numbers(
                 one["error"], data[f"{path_of(name)}_stderr"].transpose(*dims).values
             )
-        assert ("theory" in one) == (f"theory/{name}" in data) and ("whole" in one) == (
-            f"{name}_ci95" in data
-        )
+        assert ("theory" in one) == (f"theory/{name}" in data)
+        large = f"{name}_large_system"
+        assert ("whole" in one) == ("large" in one) == (large in data)
         if "theory" in one:
             assert_same_numbers(one["theory"], data[f"theory/{name}"].values)
         if "whole" in one:
-            assert_same_numbers(one["whole"], data[f"{name}_ci95"].sel(error_source="total").values)
+            assert_same_numbers(one["large"], data[large].values)
+            half_width = data[f"{large}_ci95"].sel(error_source="total")
+            assert_same_numbers(one["whole"], half_width.values)
         if not observable.extreme:
             correlated = data["diagnostics/correlation_strain"].sel(observable=name)
             assert_same_numbers(one["samples"], (strain / correlated).values)
@@ -84,7 +86,9 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
         [0.5, 0.6],
         [0.5, 0.7, 0.9],
     ]
-    assert not [name for name in by_name if re.search("_stderr|_seed|ci95|snapshot|status", name)]
+    assert not [
+        name for name in by_name if re.search("_stderr|_seed|large_system|snapshot|status", name)
+    ]
 
 
 def test_points_without_a_number_and_with_a_bad_status_are_told_apart(found) -> None:

@@ -256,7 +256,7 @@ def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(
     strains = np.asarray(grown.tally.duration).sum(axis=1)
     for k in (0, 1):
         reached = relative_error(replica(grown, k)) <= target
-        assert reached or end.status[k] >= Status.strain_limit
+        assert reached or end.status[k] >= Status.imprecise
         assert np.isclose(strains[k], 0.64) == (errors[k] <= target)
         assert reached or np.isclose(strains[k], 2.56)
         _, alone = sample_batch(only(batch, k), 0.64, error=float(target))
@@ -306,7 +306,7 @@ def test_a_sample_for_an_error_is_at_least_twice_as_long_and_its_longest_strain_
         extension, "sampled_correlation_strain", lambda *_: ready.correlation_strain
     )
     ready = batch._replace(status=np.zeros(2, int), correlation_strain=np.full(2, 0.01))
-    for error, status in ((1e9, Status.ok), (1e-9, Status.strain_limit)):
+    for error, status in ((1e9, Status.ok), (1e-9, Status.imprecise)):
         end, measured = sample_batch(ready, None, error=error)
         np.testing.assert_allclose(np.sum(measured.tally.duration, axis=1), 0.64)
         np.testing.assert_array_equal(np.maximum(measured.status, status), end.status)

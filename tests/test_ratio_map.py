@@ -144,7 +144,7 @@ def test_a_replica_that_came_to_nothing_keeps_its_status_and_is_in_no_average(
     rng, calls = np.random.default_rng(0), []
     task = [(0, 0), (0, 1), (1, 0), (1, 1)]
 
-    def measured(_, keys, advance, record=None):
+    def measured(_, keys, *__):
         calls.append(list(keys))
         return [
             (key, random_replica(rng, settings, bad if key == (0, 1) else Status.ok))
@@ -164,7 +164,7 @@ def test_a_recorder_follows_one_replica_at_a_time(settings, monkeypatch) -> None
     """Sixty replicas are sampled in batches of four without one."""
     many, sizes = replace(settings, seeds=30), []
 
-    def measured(settings, keys, advance, record):
+    def measured(settings, keys, _, advance, record):
         record(lambda *_: sizes.append(len(keys)))()
         return [(key, random_replica(np.random.default_rng(0), settings)) for key in keys]
 
@@ -179,13 +179,13 @@ def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
     """Its numbers stay the same; a single replica that does not fit is an error."""
     measured, largest, sizes = run_replicas_module._measured, 1, []
 
-    def bounded(settings, task, advance, record=None):
+    def bounded(settings, task, *rest):
         sizes.append(len(task))
         if len(task) > largest:
             raise jax.errors.JaxRuntimeError(
                 "RESOURCE_EXHAUSTED: Out of memory while trying to allocate 1 byte."
             )
-        return measured(settings, task, advance)
+        return measured(settings, task, *rest)
 
     monkeypatch.setattr(run_replicas_module, "_measured", bounded)
     tasks = [(0, 0), (0, 1), (1, 0), (1, 1)]

@@ -12,11 +12,17 @@ from synthetic import refused
 
 from jaxgran.cli.map import MAP_OPTIONS
 from jaxgran.contact.projected_methods import Jacobi
-from jaxgran.maps.automatic import chosen_settings
-from jaxgran.maps.presets import PRESETS, with_start
+from jaxgran.dynamics.batch import stack
+from jaxgran.maps.automatic import (
+    cheapest,
+    chosen_settings,
+    plans_of_sizes,
+    sampling_targets,
+)
+from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.settings import OPTIONS, MapSettings
+from jaxgran.maps.start import with_start
 from jaxgran.model.checks import InputError
-from jaxgran.model.choices import MAX_GRAINS
 from jaxgran.sampling.budget import size_error
 
 GOOD: dict[str, Any] = {
@@ -135,21 +141,33 @@ def test_the_command_and_the_function_start_alike() -> None:
 
 
 def test_an_error_chooses_grains_by_point_and_one_time_step() -> None:
-    given = {"restitution": (0.2, 0.9), "packing_fraction": (0.6, 0.82), "error": 0.2, "seeds": 1}
+    given = {"restitution": (0.2, 0.9), "packing_fraction": (0.6, 0.82), "error": 0.1, "seeds": 1}
     settings, sentence = chosen(**given, grains="auto", timestep="auto")
-    for flow in settings.flows():
-        assert (
-            size_error(float(flow.restitution), float(flow.packing_fraction), flow.grains)
-            <= 0.6 * 0.2
-        )
-    assert len({flow.grains for flow in settings.flows()}) > 1
-    assert f"{settings.grains} grains, 1 seed" in sentence and "error of 0.2" in sentence
-    assert {flow.timestep for flow in settings.flows()} == {settings.timestep}
+    flows = settings.flows()
+    for flow in flows:
+        assert size_error(flow.restitution, flow.packing_fraction, flow.grains) < 0.1
+        assert np.all(sampling_targets(settings, stack([flow])) > 0.02 / 1.96)
+    assert len({flow.grains for flow in flows}) > 1
+    assert f"{settings.grains} grains, 1 seed" in sentence and "error of 0.1" in sentence
+    assert "strains of about" in sentence and "processor time" in sentence
+    assert {flow.timestep for flow in flows} == {settings.timestep}
 
 
-def test_an_error_that_needs_too_many_grains_names_the_smallest_one() -> None:
-    given = {"restitution": (0.2,), "packing_fraction": (0.6,), "grains": "auto"}
-    with refused("error must be at least") as caught:
-        chosen(**given, error=1e-3)
-    least = float(str(caught.value).split("at least ")[1].split()[0])
-    assert chosen(**given, error=least)[0].grains <= MAX_GRAINS
+def test_the_chosen_grains_cost_least_of_those_that_reach_the_error() -> None:
+    plane = {"restitution": (0.2, 0.6, 0.95), "packing_fraction": (0.3, 0.65, 0.8)}
+    settings, _ = chosen(**plane, seeds=2, timestep=2e-4, strain=None, error=0.05, grains="auto")
+    best = cheapest(settings, 0.05)
+    assert settings.grains_by_point == (*best.grains.tolist(),) and min(best.grains) >= 256
+    for size in (256, 512, 2048, 8192, 32768):
+        other = plans_of_sizes(settings, 0.05, np.array([size]))
+        assert np.all(other.seconds[:, 0] >= best.seconds * (1 - 1e-12))
+        assert np.array_equal(other.seconds[:, 0] == best.seconds, best.grains == size)
+
+
+def test_an_error_out_of_reach_names_the_point_and_what_helps() -> None:
+    given = {"restitution": (0.9, 0.2), "packing_fraction": (0.6,), "grains": "auto"}
+    with refused("is out of reach at restitution 0.2 and packing fraction 0.6") as caught:
+        chosen(**given, timestep=1e-4, error=1e-3)
+    assert "more seeds or a shorter time step" in str(caught.value)
+    with refused("is out of reach"):  # the time step alone takes more
+        chosen(**given, timestep=1.2e-3, error=2e-3)

@@ -9,8 +9,8 @@ import pytest
 import xarray as xr
 
 import jaxgran as jg
-from jaxgran.maps.presets import combined
 from jaxgran.maps.ratio_map import ratio_map
+from jaxgran.maps.start import combined
 from jaxgran.model.checks import InputError
 from jaxgran.sampling.enskog_factors import FACTORS
 from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments

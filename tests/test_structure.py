@@ -8,7 +8,7 @@ import pytest
 from flows import GRAINS
 from synthetic import SNAPSHOTS, snapshot_of
 
-from jaxgran.analysis.force_chains import (
+from jaxgran.analysis.contacts import (
     cluster_share,
     clusters,
     loaded_contacts,

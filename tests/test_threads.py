@@ -125,12 +125,15 @@ def test_replicas_of_hours_end_within_a_second_of_ctrl_c(ctrl_c) -> None:
 def test_a_command_does_not_wait_for_a_thread_that_still_computes() -> None:
     script = """
 import threading, time
-from jaxgran.cli.terminal import end_without_threads
+from jaxgran.cli.terminal import run_program
 
-end_without_threads(1)
 threading.Thread(target=time.sleep, args=(100,), name="jaxgran-0").start()
-print("a sentence")
-end_without_threads(130)
+
+def interrupted(prog_name):
+    print("a sentence")
+    raise SystemExit(130)
+
+run_program(interrupted)
 """
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=50

@@ -30,6 +30,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
+import netCDF4  # noqa: F401 must precede h5py: if both bundle one HDF5, the second fails
+
+# isort: split
 import h5py
 import numpy as np
 

@@ -37,7 +37,7 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from jaxgran.cli.mistakes import option_name, with_options
+from jaxgran.cli.options import option_name, with_options
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.results import open_map
 from jaxgran.maps.schema import path_of
@@ -45,7 +45,7 @@ from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.settings import options as parameters
 from jaxgran.maps.variables import COORDINATES, VARIABLES
 from jaxgran.page.explore import explore
-from jaxgran.sampling.observables import OBSERVABLES, Averages
+from jaxgran.sampling.observables import OBSERVABLES, Observables
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
@@ -138,7 +138,7 @@ def variables(group: str) -> str:
 
 def formulas() -> dict[str, str]:
     """The formulas of the observables as they are written in their table."""
-    (table,) = ast.parse(inspect.getsource(Averages)).body
+    (table,) = ast.parse(inspect.getsource(Observables)).body
     rows = {row.targets[0].id: row.value.args[1].body for row in table.body if isinstance(row, ast.Assign)}
     return {name: re.sub(r"\b(s|xp)\.", "", ast.unparse(formula)) for name, formula in rows.items()}
 

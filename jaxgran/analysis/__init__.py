@@ -1,5 +1,4 @@
-"""Analysis of snapshots: force chains, coarse-grained fields, fits, and a space of jax-md.
+"""Analysis of snapshots: contacts and clusters, coarse-grained fields, fits, and a space of jax-md.
 
-It imports `dynamics` and the folders below it, but neither `sampling` nor `io`. Begin with
-`series`.
+It imports `dynamics` and the folders below it, but not `sampling`. Begin with `series`.
 """

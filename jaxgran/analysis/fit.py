@@ -101,42 +101,32 @@ def fit_trajectory(
         other collisions, which a noisy start makes likely. Or JAX traces an argument.
     """
     require_untraced("fit_trajectory", "call it with numbers", flow, start, end)
-    require_number(
-        "restitution",
-        flow.restitution,
-        lambda x: (x > 0) & (x < 1),
-        "one first guess between 0 and 1",
-    )
+    first_guess = "one first guess between 0 and 1"
+    require_number("restitution", flow.restitution, lambda x: (x > 0) & (x < 1), first_guess)
     require_whole("iterations", iterations, 10, _MOST_ITERATIONS)
     for name, noise in (("position_noise", position_noise), ("velocity_noise", velocity_noise)):
         require_number(name, noise, lambda x: (x > 0) & np.isfinite(x), "above 0")
     batch = checked_batch(require_advance, flow, start, steps)
-    if (
-        batch is None
-        or not isinstance(end, State)
-        or np.shape(end.positions) != np.shape(start.positions)
-    ):
+    shape = np.shape(start.positions) if batch else None
+    if not isinstance(end, State) or np.shape(end.positions) != shape:
         raise InputError(
             "start and end must be states with the same axis (windows,), such as prepare returns."
         )
     needed = int(np.max(lax.map(lambda x: count_events(*x, solver=_SOLVER), batch)))
     events = 8 + 3 * needed // 2 if events is None else events
     require_whole("events", events, needed, MAX_STEPS, "the most steps of an advance")
-    noises = jnp.asarray([position_noise, velocity_noise])
-    chosen = [
-        name for name, given in (("velocities", velocities), ("positions", positions)) if given
-    ]
-    unknowns = {name: jnp.zeros_like(start.positions) for name in chosen}
-    unknowns["restitution"] = jnp.asarray(flow.restitution, float)
-    _require_short(_slopes(events, batch, end, noises, unknowns)[0] * position_noise)
+    noises = {"positions": jnp.asarray(position_noise), "velocities": jnp.asarray(velocity_noise)}
+    fitted = {"velocities": velocities, "positions": positions}
+    offsets = {name: jnp.zeros(shape) for name, chosen in fitted.items() if chosen}
+    unknowns = jnp.asarray(flow.restitution, float), offsets
+    _information(events, batch, end, noises, unknowns)
     with jax.numpy_dtype_promotion("standard"):  # which optax needs
         unknowns, misfit, status = _minimised(events, iterations, batch, end, noises, unknowns)
     if np.any(np.asarray(status) == Status.capacity):
         raise InputError(
             f"events must be more than {events}: some window has more steps with contacts."
         )
-    size, information = _slopes(events, batch, end, noises, unknowns)
-    _require_short(size * position_noise)
+    information = _information(events, batch, end, noises, unknowns)
     freedom = 2 * start.positions.size - 1
     misfit = np.asarray(misfit) / freedom
     if not misfit[-1] <= 1 + 5 * np.sqrt(2 / freedom):
@@ -145,68 +135,50 @@ def fit_trajectory(
             f"{misfit[-1]:.3g} per degree of freedom: take shorter windows, another first guess, "
             "more iterations, or the true noise."
         )
-    found = _start_of(start, noises, unknowns)
+    restitution, offsets = unknowns
+    found = _moved(start, noises, offsets)
     return TrajectoryFit(
-        float(unknowns["restitution"]),
-        float(1 / np.sqrt(np.sum(information))),
+        float(restitution),
+        float(1 / np.sqrt(information)),
         misfit,
-        np.asarray(found.velocities) if velocities else None,
-        np.asarray(found.positions) if positions else None,
+        **{name: np.asarray(getattr(found, name)) for name in offsets},
     )
 
 
-def _require_short(sizes: Array) -> None:
-    worst = float(np.max(sizes))
-    if not worst <= HORIZON:
-        raise InputError(
-            f"steps must be fewer: in some window the rms of ∂(position)/∂α is {worst:.2g} "
-            f"diameters, and beyond {HORIZON:g} derivatives lose their meaning."
-        )
-
-
-def _start_of(state: State, noises: Array, unknowns: dict[str, Array]) -> State:
-    """The states with the fitted starts, which are unknowns in standard deviations of the noise."""
-    order = {"positions": noises[0], "velocities": noises[1]}
-    moved = {
-        name: getattr(state, name) + order[name] * x
-        for name, x in unknowns.items()
-        if name in order
-    }
+def _moved(state: State, noises: dict[str, Array], offsets: dict[str, Array]) -> State:
+    """The states at other starts, by offsets in standard deviations of the noise."""
+    moved = {name: getattr(state, name) + noises[name] * x for name, x in offsets.items()}
     return replace(state, **moved)
 
 
 def _residuals(
-    events: int, batch: Any, end: State, noises: Array, unknowns: dict[str, Array]
+    events: int, noises: dict[str, Array], window: Any, restitution: Array, offsets: dict
 ) -> tuple[Array, Array]:
     """Deviations of a window (grains, 4) at its end in standard deviations, positions first; and
     its status.
     """
-    flow, state, steps = batch
-    later = replace(flow, restitution=unknowns["restitution"])
-    state = _start_of(state, noises, unknowns)
-    after, tally = advance(later, state, steps, events=events, moving_contacts=True, solver=_SOLVER)
-    moved = displacement(after.positions, end.positions, after.side, after.tilt)
-    return jnp.concatenate(
-        [moved / noises[0], (after.velocities - end.velocities) / noises[1]], -1
-    ), tally.status
+    (flow, state, steps), end = window
+    later, start = replace(flow, restitution=restitution), _moved(state, noises, offsets)
+    after, tally = advance(later, start, steps, events=events, moving_contacts=True, solver=_SOLVER)
+    apart = displacement(after.positions, end.positions, after.side, after.tilt)
+    faster = after.velocities - end.velocities
+    residuals = [apart / noises["positions"], faster / noises["velocities"]]
+    return jnp.concatenate(residuals, axis=-1), tally.status
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _minimised(
-    events: int, iterations: int, batch: Any, end: State, noises: Array, unknowns: dict[str, Array]
-) -> tuple[dict[str, Array], Array, Array]:
+    events: int, iterations: int, batch: Any, end: State, noises: dict[str, Array], unknowns: Any
+) -> tuple[Any, Array, Array]:
     """The unknowns at the minimum, and χ² and the worst status of each iteration."""
 
-    def objective(unknowns: dict[str, Array], robust: Array) -> tuple[Array, tuple[Array, Array]]:
-        def of_window(window: Any) -> tuple[Array, Array]:
-            batch, end, starts = window
-            shared = {"restitution": unknowns["restitution"], **starts}
-            return _residuals(events, batch, end, noises, shared)
-
-        starts = {name: x for name, x in unknowns.items() if name != "restitution"}
-        residuals, status = lax.map(of_window, (batch, end, starts))
+    def objective(unknowns: Any, robust: Array) -> tuple[Array, tuple[Array, Array]]:
+        restitution, offsets = unknowns
+        residuals, status = lax.map(
+            lambda x: _residuals(events, noises, x[0], restitution, x[1]), ((batch, end), offsets)
+        )
         squares = jnp.sum(residuals**2, axis=-1)
-        known = sum(jnp.sum(x**2) for x in starts.values())
+        known = sum(jnp.sum(x**2) for x in offsets.values())
         value = jnp.sum(jnp.where(robust, 4 * jnp.log1p(squares / 4), squares)) + known
         return value, (jnp.sum(squares) + known, jnp.max(status))
 
@@ -214,45 +186,54 @@ def _minimised(
 
     def step(carry: Any, iteration: Array) -> tuple[Any, Any]:
         unknowns, memory = carry
-        slopes, seen = jax.grad(objective, has_aux=True)(
-            unknowns, iteration < int(_ROBUST * iterations)
-        )
+        robust = iteration < int(_ROBUST * iterations)
+        slopes, misfit_and_status = jax.grad(objective, has_aux=True)(unknowns, robust)
         updates, memory = optimiser.update(slopes, memory, unknowns)
         moved: Any = optax.apply_updates(unknowns, updates)
-        return (moved | {"restitution": jnp.clip(moved["restitution"], 0, 1)}, memory), seen
+        restitution, offsets = moved
+        return ((jnp.clip(restitution, 0, 1), offsets), memory), misfit_and_status
 
-    (unknowns, _), (misfit, status) = lax.scan(
-        step, (unknowns, optimiser.init(unknowns)), jnp.arange(iterations)
-    )
+    begin = unknowns, optimiser.init(unknowns)
+    (unknowns, _), (misfit, status) = lax.scan(step, begin, jnp.arange(iterations))
     return unknowns, misfit, status
 
 
+def _information(
+    events: int, batch: Any, end: State, noises: dict[str, Array], unknowns: Any
+) -> float:
+    """The information about α of all windows; an InputError if one is longer than the horizon."""
+    sizes, information = _sensitivities(events, batch, end, noises, unknowns)
+    longest = float(np.max(sizes))
+    if not longest <= HORIZON:
+        raise InputError(
+            f"steps must be fewer: in some window the rms of ∂(position)/∂α is {longest:.2g} "
+            f"diameters, and beyond {HORIZON:g} derivatives lose their meaning."
+        )
+    return float(np.sum(information))
+
+
 @partial(jax.jit, static_argnums=0)
-def _slopes(
-    events: int, batch: Any, end: State, noises: Array, unknowns: dict[str, Array]
+def _sensitivities(
+    events: int, batch: Any, end: State, noises: dict[str, Array], unknowns: Any
 ) -> tuple[Float[Array, " windows"], Float[Array, " windows"]]:
-    """The rms over the grains of ∂(position)/∂α in units of the noise, and the information about α,
-    of each window.
+    """The rms over the grains of ∂(position)/∂α, and the information about α, of each window.
 
     With deviations r, their slopes J by α and S by the start, which is known to one standard
     deviation, the information is Jᵀ (1 + S Sᵀ)⁻¹ J: half of the curvature of the misfit where the
     start follows.
     """
+    restitution, offsets = unknowns
 
-    def of_window(window: Any) -> tuple[Array, Array]:
-        batch, end, starts = window
+    def of_window(x: Any) -> tuple[Array, Array]:
+        window, offsets = x
+        slopes = jax.jacfwd(lambda *at: _residuals(events, noises, window, *at)[0], argnums=(0, 1))
+        by_alpha, by_start = slopes(restitution, offsets)
+        size = jnp.sqrt(jnp.mean(jnp.sum(by_alpha[:, :2] ** 2, axis=-1))) * noises["positions"]
+        slope = explained = by_alpha.ravel()
+        if offsets:  # a matrix of all pairs of deviations
+            rows = [x.reshape(slope.size, -1) for x in by_start.values()]
+            spread = sum((x @ x.T for x in rows), start=jnp.eye(slope.size))
+            explained = jnp.linalg.solve(spread, slope)
+        return size, slope @ explained
 
-        def deviations(unknowns: dict[str, Array]) -> Array:
-            return _residuals(events, batch, end, noises, unknowns)[0]
-
-        slopes = jax.jacfwd(deviations)({"restitution": unknowns["restitution"], **starts})
-        by_alpha = slopes["restitution"]
-        spread = jnp.eye(by_alpha.size)
-        for name in starts:
-            by_start = slopes[name].reshape(by_alpha.size, -1)
-            spread = spread + by_start @ by_start.T
-        size = jnp.sqrt(jnp.mean(jnp.sum(by_alpha[:, :2] ** 2, axis=-1)))
-        return size, by_alpha.ravel() @ jnp.linalg.solve(spread, by_alpha.ravel())
-
-    starts = {name: x for name, x in unknowns.items() if name != "restitution"}
-    return lax.map(of_window, (batch, end, starts))
+    return lax.map(of_window, ((batch, end), offsets))

@@ -76,6 +76,5 @@ def jax_md_space(state: State) -> JaxMdSpace:
     def shift(positions: Array, steps: Array, box: Any = None, **_: Any) -> Array:
         return wrap(positions + steps, *side_and_tilt(box))
 
-    side, tilt = state.side, state.tilt
-    box = jnp.stack([jnp.stack([side, tilt * side]), jnp.stack([jnp.zeros_like(side), side])])
+    box = state.side * jnp.eye(2, dtype=state.side.dtype).at[0, 1].set(state.tilt)
     return JaxMdSpace(displacement_in, shift, box)

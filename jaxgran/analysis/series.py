@@ -48,13 +48,8 @@ def with_errors(
     times = len(next(iter(sums.values())))
     blocks = min(times, BLOCKS)
     first = np.arange(blocks) * times // blocks
-    value, error = jackknife(
-        estimate,
-        {
-            name: np.add.reduceat(np.asarray(x, float), first, axis=0)[None]
-            for name, x in sums.items()
-        },
-    )
+    merged = {name: np.add.reduceat(np.asarray(x, float), first)[None] for name, x in sums.items()}
+    value, error = jackknife(estimate, merged)
     return {name: Measured(x, np.asarray(error[name])) for name, x in value.items()}
 
 

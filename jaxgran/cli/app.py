@@ -3,10 +3,8 @@
 """
 
 import gc
-import inspect
 import os
-import sys
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
@@ -18,33 +16,15 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jaxgran
-from jaxgran.cli.arguments import examples
 from jaxgran.cli.explore import EXPLORE_EXAMPLES, explore_command
 from jaxgran.cli.info import INFO_EXAMPLES, info_command
 from jaxgran.cli.map import MAP_EXAMPLES, PLOT_EXAMPLES, map_command, plot_command
 from jaxgran.cli.merge import MERGE_EXAMPLES, merge_command
-from jaxgran.cli.mistakes import (
-    Command,
-    Group,
-    UsageError,
-    sentence_of,
-    usage_sentence,
-    with_options,
-)
+from jaxgran.cli.options import examples
+from jaxgran.cli.output import use_plain_letters
 from jaxgran.cli.run import RUN_EXAMPLES, run_command
-from jaxgran.cli.tables import use_plain_letters
-from jaxgran.cli.terminal import (
-    INTERRUPTED,
-    NO_FILE,
-    end_without_threads,
-    outlive_readers,
-    sigterm_interrupts,
-    stop,
-    stop_interrupted,
-)
+from jaxgran.cli.terminal import run_program
 from jaxgran.cli.where import WHERE_EXAMPLES, where_command
-from jaxgran.maps.interruption import is_interruption
-from jaxgran.model.checks import InputError, short_repr
 
 EXAMPLES = {
     "Where binary collisions dominate, and where they do not": "jaxgran map",
@@ -104,7 +84,7 @@ COMMANDS = {  # with their help here, as python -OO leaves docstrings out
 }
 
 app = typer.Typer(
-    cls=Group,
+    no_args_is_help=True,
     help="Flows of rigid, frictionless discs in simple shear by contact dynamics.",
     epilog=examples(EXAMPLES),
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -112,9 +92,9 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 for name, (command, short_help, long_help, command_examples) in COMMANDS.items():
-    app.command(
-        name, cls=Command, help=long_help, short_help=short_help, epilog=examples(command_examples)
-    )(command)
+    app.command(name, help=long_help, short_help=short_help, epilog=examples(command_examples))(
+        command
+    )
 
 
 def _print_version(wanted: bool) -> None:
@@ -136,59 +116,7 @@ def command_line(
 
 
 def program() -> None:
-    """The program ``jaxgran``: the command in a process of its own, which does not wait for threads
-    that compile.
-    """
-    outlive_readers()
-    gc.set_threshold(
-        50_000, 20, 100
-    )  # raise the garbage collector's thresholds: the process is short-lived
-    try:
-        main()
-    except SystemExit as end:
-        end_without_threads(int(end.code or 0))
-        raise
-
-
-def main() -> None:
-    """Run the command that is given; a mistake in the input ends with one sentence and exit status
-    2.
-    """
+    """The program ``jaxgran``."""
+    gc.set_threshold(50_000, 20, 100)  # fewer collections: the process is short-lived
     use_plain_letters()
-    with sigterm_interrupts():
-        _run()
-
-
-def _run() -> NoReturn:
-    """Run the command that is given, and exit."""
-    try:
-        try:
-            status = app(sys.argv[1:] or ["--help"], prog_name="jaxgran", standalone_mode=False)
-        finally:
-            sys.stdout.flush()  # a full disk fails here, and not when Python ends
-    except InputError as mistake:
-        stop(sentence_of(mistake, _parameters()))
-    except UsageError as mistake:
-        stop(usage_sentence(mistake))
-    except typer.Abort:
-        status = INTERRUPTED
-    except OSError as error:
-        notes = "".join(
-            f"; {with_options(note, _parameters())}" for note in getattr(error, "__notes__", [])
-        )
-        file = "" if error.filename is None else f": {short_repr(str(error.filename))}"
-        cause = ":" if isinstance(error, ConnectionError) else " by the file system,"
-        stop(f"stopped{cause} {error.strerror or error}{file}{notes}.", NO_FILE)
-    except Exception as error:
-        if not is_interruption(error):
-            raise
-        status = INTERRUPTED
-    if status == INTERRUPTED:  # typer returns this status after Ctrl-C
-        stop_interrupted("interrupted.")
-    raise SystemExit(status)
-
-
-def _parameters() -> frozenset[str]:
-    """The parameters that are options of the command that was given."""
-    command = next((word for word in sys.argv[1:] if word in COMMANDS), "")
-    return frozenset(inspect.signature(COMMANDS[command][0]).parameters) if command else frozenset()
+    run_program(app)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from jaxgran.cli.arguments import OVERWRITE, command
+from jaxgran.cli.options import OVERWRITE, command
 from jaxgran.cli.terminal import say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, short_repr
@@ -30,7 +30,7 @@ EXPLORE_OPTIONS = {
 def run_explore_command(
     file: Path | None, output: Path | None = None, overwrite: bool = False
 ) -> None:
-    from jaxgran.io.atomic import require_place
+    from jaxgran.io.paths import require_place
     from jaxgran.maps.results import open_map
     from jaxgran.page.document import require_plotly
     from jaxgran.page.explore import explore, shows_same_map

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from jaxgran import environment
 from jaxgran.cache.folder import programs_folder, users_folder, why_unwritable
-from jaxgran.cli.arguments import command
-from jaxgran.cli.json_output import JSON, Entry, print_json
+from jaxgran.cli.options import command
+from jaxgran.cli.output import JSON, Entry, print_json
 from jaxgran.cli.terminal import configured_jax
 
 INFO_EXAMPLES = {"For a bug report": "jaxgran info"}

@@ -8,9 +8,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 
-from jaxgran.cli.arguments import FILE, QUIET, command, of_map
-from jaxgran.cli.measure import finish, print_budget, run_map
-from jaxgran.cli.tables import Table, print_table
+from jaxgran.cli.measure import finish, print_large_system, run_map
+from jaxgran.cli.options import FILE, QUIET, command, of_map
+from jaxgran.cli.output import print_table
 from jaxgran.cli.terminal import say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, refused, short_repr
@@ -111,17 +111,17 @@ def draw_beside(
 
 
 def print_tables(data) -> None:
-    """Print the ratios of a map and its errors, for the parts that have a value."""
+    """Print the force ratio of every part of a map that has one, and the averages of a large
+    system.
+    """
     import numpy as np
 
-    from jaxgran.maps.schema import parts, shear_stress_ratio
+    from jaxgran.maps.schema import parts
 
     for part in parts(data):
-        if not np.isfinite(part.force_ratio).any():
-            continue
-        print_table(_ratio_table(part, "Force ratio", part.force_ratio, part.force_ratio_stderr))
-        print_table(_ratio_table(part, "Shear-stress ratio", *shear_stress_ratio(part)))
-    print_budget(data)
+        if np.isfinite(part.force_ratio).any():
+            _print_ratio(part)
+    print_large_system(data)
 
 
 def run_plot_command(
@@ -148,24 +148,21 @@ map_command = command(MAP_OPTIONS, run_map_command)
 plot_command = command(PLOT_OPTIONS, run_plot_command, argument=FILE)
 
 
-def _ratio_table(data, name: str, ratio, stderr) -> Table:
-    """A ratio of a map with standard errors; * marks a bad status."""
+def _print_ratio(data) -> None:
+    """The force ratio of a map with standard errors; * marks a bad status."""
     rule = data.attrs["activation"]
     size = f"{data.attrs['grains']} grains, " if "grains" in data.coords else ""
     title = (
-        f"{name} at {size}dt = {data.attrs['timestep']:g} / shear rate, {rule} activation; a "
-        "column is a restitution"
+        f"Force ratio at {size}dt = {data.attrs['timestep']:g} / shear rate, {rule} activation; a "
+        "column is a restitution; *: see the status below"
     )
-    table = Table(title, ["packing fraction", *(f"{alpha:g}" for alpha in data.restitution.values)])
+    rows = []
     for nu in data.packing_fraction.values:
-        row = {"packing_fraction": nu}
-        marks = ["" if status == 0 else " *" for status in data.status.sel(row).values]
-        cells = zip(ratio.sel(row).values, stderr.sel(row).values, strict=True)
-        texts = (
-            with_error(value, error) if math.isfinite(value) else "no value"
-            for value, error in cells
-        )
-        table.rows.append(
-            [f"{nu:g}", *(text + mark for text, mark in zip(texts, marks, strict=True))]
-        )
-    return table
+        line = data.sel(packing_fraction=nu)
+        numbers = line.force_ratio.values, line.force_ratio_stderr.values, line.status.values
+        cells = [
+            (with_error(value, error) if math.isfinite(value) else "no value") + " *" * bool(status)
+            for value, error, status in zip(*numbers, strict=True)
+        ]
+        rows.append([f"{nu:g}", *cells])
+    print_table(title, ["packing fraction", *(f"{x:g}" for x in data.restitution.values)], rows)

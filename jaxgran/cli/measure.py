@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxgran.cli.mistakes import with_options
-from jaxgran.cli.tables import Table, print_table
+from jaxgran.cli.options import with_options
+from jaxgran.cli.output import print_table
 from jaxgran.cli.terminal import (
     BAD_STATUS,
     configured_jax,
@@ -23,6 +23,8 @@ from jaxgran.cli.terminal import (
 from jaxgran.maps.interruption import Interrupted
 from jaxgran.maps.settings import options
 from jaxgran.model.checks import refused
+from jaxgran.model.choices import HALF_INTERVAL
+from jaxgran.model.display import with_error
 
 _BUDGETED = (
     "force_ratio",
@@ -31,6 +33,12 @@ _BUDGETED = (
     "granular_temperature",
     "local_granular_temperature",
 )
+_SMALLER = {  # sources of an error, with the options that make them smaller
+    "sampling": "sampling (--strain)",
+    "timestep": "time step (--timestep)",
+    "size": "size (--grains)",
+    "tolerance": "tolerance (--tolerance)",
+}
 
 
 class Outcome(NamedTuple):
@@ -123,30 +131,40 @@ def _say_imprecise(data) -> None:
     )
 
 
-def print_budget(data) -> None:
-    """Print the parts of the error where any is known: those of each point, or their median and
-    largest over a map.
+def print_large_system(data) -> None:
+    """Print the averages of a large system, and where their errors come from.
+
+    For one point these are values; for a map, the median (largest) change and errors.
     """
     import numpy as np
 
-    from jaxgran.maps.schema import relative_ci95
+    from jaxgran.maps.schema import flattened, relative_ci95
+    from jaxgran.sampling.budget import MEASURED_POLYDISPERSITY
 
-    if not np.isfinite(data.force_ratio).any():
+    shown = flattened(data)
+    if not np.isfinite(shown.force_ratio).any():
         return
-    title = (
-        "Relative error, 95 %, of a large "
-        f"system{'' if data.status.size == 1 else ': median (largest)'}"
-    )
-    if "comment" in data.force_ratio_ci95.attrs:
-        title += f"\n{data.force_ratio_ci95.attrs['comment']}"
-    table = Table(title, ("observable", "sampling", "time step", "size", "tolerance", "total"))
+    point = shown.status.size == 1
+    size = f"at N = {data.attrs['grains']}" if "grains" in data.attrs else "at its N"
+    values = (size, "large system") if point else ("change", "total")
+    title = "Averages of a large system, 95 % intervals, and the parts of their errors"
+    title += "" if point else ": median (largest)"
+    if data.attrs.get("polydispersity") != MEASURED_POLYDISPERSITY:
+        title += f"\n{shown.pressure_large_system.attrs['comment']}"
+    rows = []
     for name in _BUDGETED:
-        parts = relative_ci95(data, name)
-        ordered = (parts[part] for part in ("sampling", "timestep", "size", "tolerance", "total"))
-        cells = [_percent(part) for part in ordered]
-        cells[1] = "at its dt" if name == "force_ratio" else cells[1]
-        table.rows.append([name.replace("_", " "), *cells])
-    print_table(table)
+        errors = relative_ci95(data, name)
+        at_size, large = shown[name].values, shown[f"{name}_large_system"].values
+        if point:
+            half = HALF_INTERVAL * shown[f"{name}_stderr"].item()
+            whole = errors["total"].item() * abs(large.item())
+            cells = [with_error(at_size.item(), half), with_error(large.item(), whole)]
+        else:
+            cells = [_percent(large / at_size - 1), _percent(errors["total"])]
+        parts = {source: _percent(errors[source]) for source in _SMALLER}
+        parts |= {"timestep": "at its dt"} if name == "force_ratio" else {}
+        rows.append([name.replace("_", " "), *cells, *parts.values()])
+    print_table(title, ("observable", *values, *_SMALLER.values()), rows)
 
 
 def _percent(part) -> str:
@@ -158,7 +176,8 @@ def _percent(part) -> str:
     known = part[np.isfinite(part)]
     if known.size == 0:
         return ""
-    median, largest = (f"{float(f'{100 * x:.2g}'):g}" for x in (np.median(known), known.max()))
+    largest = known.flat[np.argmax(abs(known))]
+    median, largest = (f"{float(f'{100 * x:.2g}'):g}" for x in (np.median(known), largest))
     return f"{median} %" if part.size == 1 else f"{median} ({largest}) %"
 
 

@@ -3,9 +3,9 @@
 import os
 from pathlib import Path
 
-from jaxgran.cli.arguments import OVERWRITE, command
 from jaxgran.cli.map import MAP_OPTIONS, draw_beside, print_tables, require_new_figures
 from jaxgran.cli.measure import command_line, finish
+from jaxgran.cli.options import OVERWRITE, command
 from jaxgran.cli.terminal import configured_jax, require_device
 from jaxgran.maps.options import Option
 from jaxgran.maps.settings import OPTIONS
@@ -29,7 +29,7 @@ def run_merge_command(
 ) -> None:
     configured_jax()
     require_device()
-    from jaxgran.io.atomic import require_place
+    from jaxgran.io.paths import require_place
     from jaxgran.maps.merge import merge_maps
     from jaxgran.maps.results import write_dataset
 

@@ -2,15 +2,15 @@
 
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from jaxgran.cli.arguments import QUIET, command, of_map
-from jaxgran.cli.json_output import JSON, Entry, print_json
-from jaxgran.cli.measure import finish, print_budget, run_map
-from jaxgran.cli.tables import Table, print_table
+from jaxgran.cli.measure import finish, print_large_system, run_map
+from jaxgran.cli.options import QUIET, command, of_map
+from jaxgran.cli.output import JSON, Entry, print_json, print_table
 from jaxgran.cli.terminal import configured_jax, counted, say
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, require_number, short_repr
@@ -70,6 +70,15 @@ RUN_OPTIONS["strain"] = replace(
 RUN_OPTIONS["seeds"] = replace(RUN_OPTIONS["seeds"], default="1")
 
 
+class FrameFiles(NamedTuple):
+    """The files of frames that were asked for."""
+
+    trajectory: Path | None
+    movie: Path | None
+    frame_strain: float | None
+    force_strain: float | None
+
+
 def run_run_command(
     restitution: float,
     packing_fraction: float,
@@ -82,59 +91,51 @@ def run_run_command(
     quiet: bool = False,
     **given: Any,
 ) -> None:
-    frames_wanted = any(x is not None for x in (trajectory, movie))
-    chosen = {"seeds": 1, **given}
-    if frames_wanted:
-        if chosen["seeds"] > 1:
-            raise InputError(
-                "`trajectory` and `movie` show one seed: leave out `seeds`.", field="seeds"
-            )
-        if "error" not in chosen:
-            chosen.setdefault("strain", _RECORDED_STRAIN)
-    strain = chosen.get("strain", _RECORDED_STRAIN)
-    for name, file in (("trajectory", trajectory), ("movie", movie)):
-        if file is not None and os.path.isfile(file) and not chosen.get("overwrite"):
-            raise InputError(
-                f"{name} {short_repr(str(file))} already exists; pass `overwrite=True` to replace "
-                "it.",
-                field=name,
-            )
-    recorder, frames = _recorder(trajectory, movie, frame_strain, force_strain, strain)
+    files = FrameFiles(trajectory, movie, frame_strain, force_strain)
+    chosen = _settled(files, given)
+    recorder, film = _recorder(files, chosen.get("strain", _RECORDED_STRAIN))
     record = None if recorder is None else recorder.recording
-    output = chosen.get("output")
     plane = {"restitution": (restitution,), "packing_fraction": (packing_fraction,)}
     data, interrupted, written = run_map({**plane, **chosen, "record": record}, quiet)
     if json:
         print_json(_entries(data))
     elif bool(data.force_ratio.notnull().any()):
-        print_table(_summary_table(data, all))
-        print_budget(data)
+        _print_averages(data, all)
+        print_large_system(data)
     if recorder is not None and recorder.frames:
-        say(
-            "recording frames split the run at different steps, so averages change within their "
-            "errors."
-        )
-        if trajectory is not None:
-            say(f"wrote {trajectory}: {recorder.frames} frames")
-        if movie is not None:
-            _write_movie(movie, frames, quiet)
+        _write_frames(files, recorder.frames, film, quiet)
+    output = chosen.get("output")
     finish(data, [output] if output is not None and written else [], interrupted, output)
 
 
 run_command = command(RUN_OPTIONS, run_run_command, required=("restitution", "packing_fraction"))
 
 
-def _recorder(
-    trajectory: Path | None,
-    movie: Path | None,
-    frame_strain: float | None,
-    force_strain: float | None,
-    strain: float,
-):
+def _settled(files: FrameFiles, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of the flow: one seed, and a short strain where frames are recorded."""
+    chosen = {"seeds": 1, **given}
+    named = {"trajectory": files.trajectory, "movie": files.movie}
+    if any(named.values()) and chosen["seeds"] > 1:
+        raise InputError(
+            "`trajectory` and `movie` show one seed: leave out `seeds`.", field="seeds"
+        )
+    if any(named.values()) and "error" not in chosen:
+        chosen.setdefault("strain", _RECORDED_STRAIN)
+    for name, file in named.items():
+        if file is not None and os.path.isfile(file) and not chosen.get("overwrite"):
+            raise InputError(
+                f"{name} {short_repr(str(file))} already exists; pass `overwrite=True` to replace "
+                "it.",
+                field=name,
+            )
+    return chosen
+
+
+def _recorder(files: FrameFiles, strain: float):
     """The recorder of the flow and the frames of its movie; None if there is no file for it."""
-    if trajectory is None and movie is None:
-        for name, value in (("frame_strain", frame_strain), ("force_strain", force_strain)):
-            if value is not None:
+    if files.trajectory is None and files.movie is None:
+        for name in ("frame_strain", "force_strain"):
+            if getattr(files, name) is not None:
                 raise InputError(f"`{name}` requires `trajectory` or `movie`.", field=name)
         return None, None
     configured_jax()
@@ -142,38 +143,47 @@ def _recorder(
     from jaxgran.plotting.movie import MOST_DRAWN, Frames, check_movie
     from jaxgran.sampling.recorder import Recorder
 
-    if frame_strain is not None:
-        most_frames = MOST_RECORDED if movie is None else MOST_DRAWN
-        least, most = strain / most_frames, strain
+    every = strain / 100
+    if files.frame_strain is not None:
+        most = MOST_RECORDED if files.movie is None else MOST_DRAWN
         accepted = (
-            f"at least {least:g}, for {most_frames} frames, and at most the sampled strain, "
-            f"{most:g}"
+            f"at least {strain / most:g}, for {most} frames, and at most the sampled strain, "
+            f"{strain:g}"
         )
+        every = files.frame_strain
         require_number(
-            "frame_strain", frame_strain, lambda x: (x >= 0.99 * least) & (x <= most), accepted
+            "frame_strain", every, lambda x: (x >= 0.99 * strain / most) & (x <= strain), accepted
         )
-    every = strain / 100 if frame_strain is None else frame_strain
-    if force_strain is not None:
+    if files.force_strain is not None:
         accepted = f"above 0 and at most the strain between frames, {every:g}"
-        require_number("force_strain", force_strain, lambda x: (x > 0) & (x <= every), accepted)
-    keep, frames = [], Frames()
-    if trajectory is not None:
-        check_trajectory(trajectory)
-        keep.append(partial(write_frame, trajectory))
-    if movie is not None:
-        check_movie(movie)
-        keep.append(frames.keep)
-    return Recorder(every, *keep, force_strain=force_strain or 0.0), frames
+        require_number(
+            "force_strain", files.force_strain, lambda x: (x > 0) & (x <= every), accepted
+        )
+    keep, film = [], Frames()
+    if files.trajectory is not None:
+        check_trajectory(files.trajectory)
+        keep.append(partial(write_frame, files.trajectory))
+    if files.movie is not None:
+        check_movie(files.movie)
+        keep.append(film.keep)
+    return Recorder(every, *keep, force_strain=files.force_strain or 0.0), film
 
 
-def _write_movie(movie: Path, frames, quiet: bool) -> None:
-    """Draw and write the movie, with progress unless quiet."""
+def _write_frames(files: FrameFiles, frames: int, film, quiet: bool) -> None:
+    """Draw the movie, with progress unless quiet, and say what was written."""
     from jaxgran.plotting.movie import write_movie
 
-    if not quiet:
-        say(f"drawing {len(frames)} frames")
-    write_movie(movie, frames, follow=iter if quiet else partial(counted, words="frames"))
-    say(f"wrote {movie}: {len(frames)} frames")
+    say(
+        "recording frames split the run at different steps, so averages change within their errors."
+    )
+    if files.trajectory is not None:
+        say(f"wrote {files.trajectory}: {frames} frames")
+    if files.movie is not None:
+        if not quiet:
+            say(f"drawing {len(film)} frames")
+        follow = iter if quiet else partial(counted, words="frames")
+        write_movie(files.movie, film, follow=follow)
+        say(f"wrote {files.movie}: {len(film)} frames")
 
 
 def _entries(data) -> dict[str, Entry]:
@@ -182,6 +192,7 @@ def _entries(data) -> dict[str, Entry]:
     """
     from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
     from jaxgran.maps.status_report import bad_points
+    from jaxgran.sampling.budget import LARGE_SYSTEM
     from jaxgran.sampling.observables import OBSERVABLES
 
     point = flattened(data).isel(packing_fraction=0, restitution=0)
@@ -205,6 +216,11 @@ def _entries(data) -> dict[str, Entry]:
             one.unit,
             point[f"{path}_stderr"].values if f"{path}_stderr" in point else None,
         )
+    for name in LARGE_SYSTEM:
+        path, row = f"{name}_large_system", OBSERVABLES[name]
+        total = point[f"{path}_ci95"].sel(error_source="total")
+        entries[path] = Entry(point[path].values, f"{row.meaning}, of a large system", row.unit)
+        entries[f"{path}_ci95"] = Entry(total.values, total.long_name, row.unit)
     ratio, error = shear_stress_ratio(point)
     meaning = "contact shear stress over binary shear stress"
     entries["shear_stress_ratio"] = Entry(ratio.values, meaning, "1", error.values)
@@ -215,8 +231,8 @@ def _entries(data) -> dict[str, Entry]:
     return entries
 
 
-def _summary_table(data, all: bool) -> Table:
-    """The averages of one flow with errors, units, effective sample sizes and predictions of
+def _print_averages(data, all: bool) -> None:
+    """Print the averages of one flow with errors, units, effective sample sizes and predictions of
     kinetic theory.
     """
     from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
@@ -235,7 +251,7 @@ def _summary_table(data, all: bool) -> Table:
         "effective samples",
         "kinetic theory",
     )
-    table = Table(title, columns, numbers=False)
+    rows: list[list[str]] = []
     point = flattened(data).isel(packing_fraction=0, restitution=0)
     strain = float(point["sums/strain"].sum())
     correlated = point["diagnostics/correlation_strain"].to_series().to_dict()
@@ -244,7 +260,7 @@ def _summary_table(data, all: bool) -> Table:
         return float(point[name]) if name in point else math.nan
 
     for group, names in (GROUPS if all else {"/": _PHYSICS}).items():
-        table.rows += [] if group == "/" else [[group.capitalize()]]
+        rows += [] if group == "/" else [[group.capitalize()]]
         for name in names:
             if OBSERVABLES[name].tensor:
                 continue
@@ -253,16 +269,12 @@ def _summary_table(data, all: bool) -> Table:
             samples = strain / correlated.get(name, math.nan)
             theory = number(f"theory/{name}")
             texts = ["" if math.isnan(x) else f"{x:.3g}" for x in (samples, theory)]
-            table.rows.append(
-                [name.replace("_", " "), value, unit_text(OBSERVABLES[name].unit), *texts]
-            )
+            rows.append([name.replace("_", " "), value, unit_text(OBSERVABLES[name].unit), *texts])
             if name == "force_ratio":
                 ratio = with_error(*map(float, shear_stress_ratio(point)))
-                table.rows.append(["shear-stress ratio", ratio, "", "", ""])
+                rows.append(["shear-stress ratio", ratio, "", "", ""])
             if name == "binary_dissipation_rate":
                 for length in (f"theory/{name}" for name in LENGTHS):
                     value = with_error(number(length), number(f"{length}_stderr"))
-                    table.rows.append(
-                        [length[7:].replace("_", " "), value, unit_text("sigma"), "", ""]
-                    )
-    return table
+                    rows.append([length[7:].replace("_", " "), value, unit_text("sigma"), "", ""])
+    print_table(title, columns, rows, numbers=False)

@@ -1,4 +1,4 @@
-"""Shared by all commands: exit statuses, sentences on standard error, the set-up of JAX.
+"""How a command ends, and what it says on standard error.
 
 ===========  ========================================================
 exit status  meaning
@@ -17,15 +17,15 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
-from io import BufferedWriter, FileIO, TextIOWrapper
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from jaxgran.cache.folder import cache_folder, fallback_message, use_cache
 from jaxgran.environment import devices
+from jaxgran.maps.interruption import is_interruption
+from jaxgran.model.checks import InputError, short_repr
 
 NO_FILE = 1
 INPUT_MISTAKE = 2
@@ -34,7 +34,101 @@ INTERRUPTED = 130
 TERMINATED = 143
 
 _T = TypeVar("_T")
-_terminated = False  # whether SIGTERM has come
+
+
+def run_command(command: Callable[[], None], sentence: Callable[[Any], str]) -> None:
+    """Run a command; a mistake in its input, a file that cannot be written and an interruption end
+    it with one sentence, made from a message by ``sentence``.
+    """
+    _Terminated.now = False
+    before = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        command()
+    except InputError as mistake:
+        stop(sentence(mistake))
+    except (SystemExit, BrokenPipeError):
+        raise  # Typer ends a command whose reader has gone
+    except OSError as error:
+        stop(_of_file(error, sentence), NO_FILE)
+    except BaseException as error:
+        if not is_interruption(error):
+            raise
+        stop_interrupted("interrupted.")
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _of_file(error: OSError, sentence: Callable[[Any], str] = str) -> str:
+    notes = "".join(f"; {sentence(note)}" for note in getattr(error, "__notes__", []))
+    file = "" if error.filename is None else f": {short_repr(str(error.filename))}"
+    cause = ":" if isinstance(error, ConnectionError) else " by the file system,"
+    return f"stopped{cause} {error.strerror or error}{file}{notes}."
+
+
+def run_program(app: Callable[..., Any]) -> NoReturn:
+    """Run the program, and end its process."""
+    status = 0
+    try:
+        try:
+            app(prog_name="jaxgran")
+        finally:
+            sys.stdout.flush()  # a full disk fails here, and not when Python ends
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python fails as it ends
+        if not isinstance(error, BrokenPipeError):
+            say(f"jaxgran: {_of_file(error)}")
+        status = NO_FILE
+    except SystemExit as end:
+        status = int(end.code or 0)
+    _end_without_threads(status)
+    raise SystemExit(status)
+
+
+class _Terminated:
+    """Whether SIGTERM has come."""
+
+    now = False
+
+
+def _interrupt(*_: object) -> NoReturn:
+    """The first SIGTERM interrupts as Ctrl-C does, but leads to another exit status."""
+    _Terminated.now = True
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # finished points are being saved
+    raise KeyboardInterrupt
+
+
+def _end_without_threads(status: int) -> None:
+    """End the process if a thread of this package still computes or compiles.
+
+    Python would wait for it, as for a minute of a large system; if it did not wait, XLA would end
+    the process by a segmentation fault.
+    """
+    if any(thread.name.startswith("jaxgran-") for thread in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def say(sentence: str) -> None:
+    """Print on standard error."""
+    print(sentence, file=sys.stderr)
+
+
+def say_written(paths: Iterable[Path]) -> None:
+    """Print the names of the written files."""
+    for path in paths:
+        say(f"wrote {path}")
+
+
+def stop(sentence: str, status: int = INPUT_MISTAKE) -> NoReturn:
+    """Print why the command ends, and exit with the status."""
+    say(f"jaxgran: {sentence}")
+    raise SystemExit(status)
+
+
+def stop_interrupted(sentence: str) -> NoReturn:
+    """Print that the command was interrupted, and exit with the status of the signal."""
+    stop(sentence, TERMINATED if _Terminated.now else INTERRUPTED)
 
 
 def configured_jax():
@@ -68,88 +162,6 @@ def _say_cache() -> None:
     folder = cache_folder()
     if folder is not None:
         os.environ.setdefault("MPLCONFIGDIR", str(folder / "matplotlib"))
-
-
-def outlive_readers() -> None:
-    """Discard output whose reader has gone, as in ``| head``, instead of failing."""
-    for name in ("stdout", "stderr"):
-        stream = getattr(sys, name)
-        if type(stream) is TextIOWrapper and not stream.isatty():
-            stream.flush()
-            buffer = BufferedWriter(_Outliving(stream.fileno(), "w", closefd=False))
-            lines, encoding = stream.line_buffering, stream.encoding
-            setattr(sys, name, TextIOWrapper(buffer, encoding, stream.errors, line_buffering=lines))
-
-
-class _Outliving(FileIO):
-    """A pipe or a file that discards output once its reader has gone, or once it has failed with an
-    OSError.
-    """
-
-    _failed = False
-
-    def write(self, content: Any) -> int:
-        if self._failed:
-            return len(content)
-        try:
-            return super().write(content)
-        except BrokenPipeError:
-            return len(content)
-        except OSError as error:
-            self._failed = True
-            error.filename = "standard output" if self.fileno() == 1 else "standard error"
-            raise
-
-
-def say(sentence: str) -> None:
-    """Print on standard error."""
-    print(sentence, file=sys.stderr)
-
-
-def say_written(paths: Iterable[Path]) -> None:
-    """Print the names of the written files."""
-    for path in paths:
-        say(f"wrote {path}")
-
-
-def stop(sentence: str, status: int = INPUT_MISTAKE) -> NoReturn:
-    """Print why the command ends, and exit with the status."""
-    say(f"jaxgran: {sentence}")
-    raise SystemExit(status)
-
-
-@contextmanager
-def sigterm_interrupts() -> Iterator[None]:
-    """The first SIGTERM interrupts the block as Ctrl-C does, but leads to another exit status."""
-    global _terminated
-    _terminated = False
-
-    def interrupt(*_: object) -> NoReturn:
-        global _terminated
-        _terminated = True
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # finished points are being saved
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def end_without_threads(status: int) -> None:
-    """End the process if a thread of this package still computes or compiles, which Python would
-    wait for.
-    """
-    if any(thread.name.startswith("jaxgran-") for thread in threading.enumerate()):
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
-
-
-def stop_interrupted(sentence: str) -> NoReturn:
-    """Print that the command was interrupted, and exit with the status of the signal."""
-    stop(sentence, TERMINATED if _terminated else INTERRUPTED)
 
 
 def counted(items: Sequence[_T], words: str) -> Iterator[_T]:

@@ -1,21 +1,23 @@
 """The command ``where``: what kinetic theory can predict in a flow, without a simulation."""
 
-from jaxgran.cli.arguments import command
-from jaxgran.cli.json_output import JSON, Entry, print_json
-from jaxgran.cli.tables import Table, plain, print_table
+from jaxgran.cli.options import command
+from jaxgran.cli.output import JSON, Entry, print_json, print_table, print_text
 from jaxgran.maps.options import Option
 from jaxgran.model.display import with_error
-from jaxgran.reference.table import FACTORS, MEASURED, THEORIES, shipped_table
+from jaxgran.reference.table import MEASURED, THEORIES, shipped_table
 from jaxgran.reference.validity import COLUMNS, Validity, validity
 
 WHERE_EXAMPLES = {
     "Does kinetic theory hold at a restitution and a packing fraction": "jaxgran where "
-    "--restitution 0.7 --packing-fraction 0.6",
-    "The same for a program": "jaxgran where --restitution 0.7 --packing-fraction 0.6 --json",
+    "--restitution 0.5 --packing-fraction 0.7",
+    "And which of its assumptions fails": "jaxgran where --restitution 0.5 --packing-fraction 0.7 "
+    "--factors",
 }
 WHERE_OPTIONS = {
     "restitution": Option("Coefficient of restitution α, in the range of the reference map."),
     "packing_fraction": Option("Packing fraction ν, in the range of the reference map."),
+    "factors": Option("Print how far every assumption of the theory is off.", bool),
+    "corrected": Option("Print also the theory with measured correlations.", bool),
     "json": JSON,
 }
 _UNITS = MEASURED | {"force_ratio": "1"}
@@ -28,64 +30,63 @@ _ASSUMPTIONS = {
 }
 
 
-def run_where_command(restitution: float, packing_fraction: float, json: bool = False) -> None:
-    found = validity(restitution, packing_fraction)
+def run_where_command(
+    restitution: float,
+    packing_fraction: float,
+    factors: bool = False,
+    corrected: bool = False,
+    json: bool = False,
+) -> None:
+    flow = validity(restitution, packing_fraction)
     if json:
-        print_json(_entries(found))
+        print_json(_entries(flow))
         return
-    table = shipped_table()
-    print(plain(found.verdict()))
+    print_text(flow.verdict())
+    columns = len(COLUMNS) if corrected else len(COLUMNS) - 1
     about = f"α = {restitution:g}, ν = {packing_fraction:g}; ± 95 %; units of m, σ and 1/γ̇"
-    averages = Table(about, COLUMNS, found.rows())
-    print_table(averages)
-    assumed = (
-        "Enskog's contact pressure at the measured granular temperature, one assumption "
-        "after the other"
-    )
-    factors = Table(assumed, ("assumed", "factor if measured instead"))
-    for name in FACTORS:
-        factor = with_error(float(found.factors[name]), float(found.factors_ci95[name]))
-        factors.rows.append([_ASSUMPTIONS[name], factor])
-    print_table(factors)
-    print(
-        plain(
-            f"Reference map: {table.made_with}. Kinetic theory: {THEORIES[table.head['theory']]}."
+    print_table(about, COLUMNS[:columns], (row[:columns] for row in flow.rows()))
+    if factors:
+        rows = (
+            (words, with_error(float(flow.factors[name]), float(flow.factors_ci95[name])))
+            for name, words in _ASSUMPTIONS.items()
         )
-    )
+        assumed = "Enskog's contact pressure at the measured granular temperature"
+        print_table(assumed, ("assumed", "factor if measured instead"), rows)
+    table = shipped_table()
+    theory = THEORIES[table.head["theory"]]
+    print_text(f"Reference map: {table.made_with}. Kinetic theory: {theory}.")
 
 
-def _entries(found: Validity) -> dict[str, Entry]:
+def _entries(flow: Validity) -> dict[str, Entry]:
     """The entries of the JSON object."""
     head = shipped_table().head
     entries = {
-        "verdict": Entry(found.verdict(), "what kinetic theory can predict, in a sentence", None),
-        "restitution": Entry(found.restitution, "coefficient of restitution"),
-        "packing_fraction": Entry(found.packing_fraction, "packing fraction"),
-        "fails_first": Entry(found.fails_first(), "assumption that is furthest off", None),
+        "verdict": Entry(flow.verdict(), "what kinetic theory can predict, in a sentence", None),
+        "restitution": Entry(flow.restitution, "coefficient of restitution"),
+        "packing_fraction": Entry(flow.packing_fraction, "packing fraction"),
+        "fails_first": Entry(flow.fails_first(), "assumption that is furthest off", None),
     }
-    half = "half-width of the 95 % interval"
-    for name, unit in _UNITS.items():
-        entries[name] = Entry(found.measured[name], "measured average", unit)
-        entries[f"{name}_ci95"] = Entry(found.measured_ci95[name], half, unit)
-    for name, value in found.theory.items():
-        entries[f"theory/{name}"] = Entry(value, "prediction of kinetic theory", _UNITS[name])
-    for name, value in found.error.items():
-        entries[f"error/{name}"] = Entry(value, "kinetic theory over measured average, less one")
-        entries[f"error/{name}_ci95"] = Entry(found.error_ci95[name], half)
-    for name, value in found.corrected.items():
-        entries[f"corrected/{name}"] = Entry(
-            value, "prediction of the corrected theory", _UNITS[name]
-        )
-    for name, value in found.corrected_error.items():
-        entries[f"corrected_error/{name}"] = Entry(
-            value, "corrected theory over measured average, less one"
-        )
-        entries[f"corrected_error/{name}_ci95"] = Entry(found.corrected_error_ci95[name], half)
-    for name, value in found.factors.items():
-        entries[f"factor/{name}"] = Entry(
-            value, f"contact pressure as measured, over that if {_ASSUMPTIONS[name]}"
-        )
-        entries[f"factor/{name}_ci95"] = Entry(found.factors_ci95[name], half)
+    of_theory = "kinetic theory over measured average, less one"
+    groups = (
+        ("", flow.measured, flow.measured_ci95, "measured average"),
+        ("theory/", flow.theory, {}, "prediction of kinetic theory"),
+        ("error/", flow.error, flow.error_ci95, of_theory),
+        ("corrected/", flow.corrected, {}, "prediction of the corrected theory"),
+        (
+            "corrected_error/",
+            flow.corrected_error,
+            flow.corrected_error_ci95,
+            f"corrected {of_theory[8:]}",
+        ),
+        ("factor/", flow.factors, flow.factors_ci95, "contact pressure as measured, over that if "),
+    )
+    for group, values, half_widths, meaning in groups:
+        for name, value in values.items():
+            unit = _UNITS[name] if group in ("", "theory/", "corrected/") else "1"
+            entries[group + name] = Entry(value, meaning + _ASSUMPTIONS.get(name, ""), unit)
+            if name in half_widths:
+                half = Entry(half_widths[name], "half-width of the 95 % interval", unit)
+                entries[f"{group}{name}_ci95"] = half
     grains = head["grains"]  # a number, or in words where it depends on the flow
     entries["grains"] = Entry(
         int(grains) if grains.isdecimal() else grains, "number of grains of the reference map"

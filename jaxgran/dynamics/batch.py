@@ -16,11 +16,11 @@ within ``jit``, ``vmap``, … by ``vmap``, or in turn (``over_replicas``)
 ==========================  ========================================================================
 """
 
-import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
 from queue import SimpleQueue
-from threading import Event, Thread
+from threading import Event
 from typing import Any, TypeVar
 
 import jax
@@ -43,7 +43,6 @@ Send = Callable[[Any], None]
 T = TypeVar("T")
 _DIMENSIONS = (1, 1, 2, 2, 0, 0)  # of the arrays of one state, in the order of its leaves
 _DEVICES = "devices"
-_MESSAGE, _RESULT, _ERROR = range(3)
 
 
 def stack(flows: Sequence[ShearFlow]) -> ShearFlow:
@@ -243,7 +242,11 @@ def predicted_cost(flow: ShearFlow, timestep: Any = None) -> Any:
     networks; the second factor is their cost at dt = 1e-3. Steps without a contact are jumped over,
     so ten times as many steps cost little more than twice as much.
     """
-    numbers = flow.restitution, flow.packing_fraction, timestep or flow.timestep
+    numbers = (
+        flow.restitution,
+        flow.packing_fraction,
+        flow.timestep if timestep is None else timestep,
+    )
     alpha, nu, dt = (np.asarray(x, float) for x in numbers)
     network = 8 + 600 * (1 - alpha) * np.exp((nu - 0.8) / 0.04)
     return flow.grains * network * (1e-3 / dt) ** 0.35
@@ -277,54 +280,44 @@ def in_threads(
     Raises:
       BaseException: that of a task, with its traceback.
     """
-    waiting, cancelled = iter(list(enumerate(tasks))), Event()  # the threads share this iterator
-    events: SimpleQueue[tuple[int, Any]] = SimpleQueue()
+    events: SimpleQueue[Any] = SimpleQueue()  # messages and futures that are done
+    cancelled = Event()
     config: Any = jax.config
     x64, device = config.jax_enable_x64, config.jax_default_device
 
     def send(message: Any) -> None:
         if cancelled.is_set():
             raise Cancelled
-        events.put((_MESSAGE, message))
+        events.put(message)
 
-    def work() -> None:
+    def call(arguments: tuple) -> T:
+        if cancelled.is_set():
+            raise Cancelled
         with jax.enable_x64(x64), jax.default_device(device):  # each thread has its own
-            for number, arguments in waiting:
-                if cancelled.is_set():
-                    return
-                try:
-                    events.put((_RESULT, (number, function(*arguments, send))))
-                except BaseException as error:
-                    events.put((_ERROR, error))
-                    return
+            return function(*arguments, send)
 
-    running = [Thread(target=work, name=f"jaxgran-{k}") for k in range(min(threads, len(tasks)))]
-    unfinished = len(tasks)
-    try:
-        for thread in running:
-            thread.start()
-        while unfinished:
-            kind, content = events.get()
-            if kind == _ERROR:
-                raise content
-            if kind == _MESSAGE:
-                on_message(content)
-            else:
-                unfinished -= 1
-                yield content
-    except KeyboardInterrupt:
+    def end() -> None:
         cancelled.set()
+        pool.shutdown(wait=False, cancel_futures=True)
+        running = [future for future in futures if future.running()]
+        pool.shutdown(wait=not wait(running, PATIENCE).not_done)
+
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="jaxgran-batch")
+    futures: dict[Future, int] = {}
+    try:
+        for number, arguments in enumerate(tasks):
+            future = pool.submit(call, arguments)
+            futures[future] = number
+            future.add_done_callback(events.put)
+        while futures:
+            event = events.get()
+            if isinstance(event, Future):
+                yield futures.pop(event), event.result()
+            else:
+                on_message(event)
+    except KeyboardInterrupt:
         with engines_stopped():
-            _join(running)
+            end()
         raise
     finally:
-        cancelled.set()
-        _join(running)
-
-
-def _join(threads: Iterable[Thread]) -> None:
-    """Wait for the end of the threads, but not for long."""
-    end = time.monotonic() + PATIENCE
-    for thread in threads:
-        if thread.is_alive():  # one that was never started cannot be joined
-            thread.join(max(0.0, end - time.monotonic()))
+        end()

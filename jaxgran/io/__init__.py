@@ -1,5 +1,4 @@
 """Files: trajectories (GSD), and arrays with a checksum.
 
-It imports `dynamics` and the folders below it, but neither `sampling` nor `analysis`. Begin with
-`trajectory`.
+It imports `analysis` and the folders below it, but not `sampling`. Begin with `trajectory`.
 """

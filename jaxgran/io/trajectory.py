@@ -40,26 +40,28 @@ log/jaxgran/format_version     (1,)            –       of these chunks; files 
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import gsd.fl
+import gsd.hoomd
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxgran.analysis.contacts import pair_forces
+from jaxgran.analysis.series import series
 from jaxgran.contact.clusters import cluster_labels
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.engine import checked_numerics
 from jaxgran.dynamics.snapshots import Snapshot, snapshots_from
 from jaxgran.files import atomic_write, other_version
-from jaxgran.io.atomic import require_place
+from jaxgran.io.paths import require_place
 from jaxgran.model.batches import equal_values
-from jaxgran.model.cell import centred, remap_tilt, wrap
-from jaxgran.model.checks import InputError, require_number, short_repr
+from jaxgran.model.cell import centred
+from jaxgran.model.checks import InputError, refused, require_number, short_repr
 from jaxgran.model.flow import ShearFlow, steps_of_strain
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State, require_state
@@ -68,22 +70,12 @@ FORMAT_VERSION = 1
 """Version of the chunks of jaxgran."""
 
 _SCHEMA_VERSION = [1, 4]  # gsd 5 writes 2.0 by default, which older versions of gsd reject
-_NUMBERS = ("strain", "timestep", "shear_rate", "restitution")
-_NEEDED = {"position": "positions", "velocity": "velocities"}
-_EXACT = "log/particles/exact_"
-_READ = (
-    *(f"configuration/{name}" for name in ("step", "dimensions", "box")),
-    *(f"particles/{name}" for name in ("N", "position", "velocity", "diameter", "mass")),
-    *(f"{_EXACT}{name}" for name in ("position", "velocity", "radius", "mass")),
-    *(f"log/jaxgran/{name}" for name in ("side", "tilt", "format_version", *_NUMBERS)),
-)
-Chunks = dict[str, Any]  # arrays of a frame by name
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Trajectory:
-    """States and parameters of a flow, read from the frames of a file in its precision.
+    """States and parameters of a flow, read from the frames of a file.
 
     ================  =========  =====  ============================================================
     field             shape      unit   meaning
@@ -98,9 +90,7 @@ class Trajectory:
     packing_fraction  ()         –      ν
     ================  =========  =====  ============================================================
 
-    All are NumPy arrays, in double precision even if JAX uses single precision. Strain, time step,
-    shear rate and restitution are NaN if the file, written by another program, does not contain
-    them.
+    All are NumPy arrays, in double precision even if JAX uses single precision.
     """
 
     state: State
@@ -118,7 +108,7 @@ def check_trajectory(path: Path) -> None:
     """Raise an InputError unless a trajectory can be written to ``path``."""
     require_place(path, "trajectory", ".gsd")
     if os.fsencode(path).decode(errors="ignore") != str(path):  # the GSD library needs UTF-8 names
-        raise InputError(f"trajectory must be a file name in UTF-8, not {short_repr(str(path))}.")
+        raise refused("trajectory", str(path), "must be a file name in UTF-8")
 
 
 def write_frame(path: Path, frame: Snapshot, step: int) -> None:
@@ -134,18 +124,18 @@ def write_frame(path: Path, frame: Snapshot, step: int) -> None:
     Raises:
       OSError: with the name of the file.
     """
-    if step:
-        size = path.stat().st_size
-        try:
-            _write(path, "r+", frame, step)
-        except OSError as error:
-            os.truncate(path, size)
-            if error.errno:
-                error.filename = str(path)
-            raise
-    else:
+    if step == 0:
         with atomic_write(path) as temporary:
-            _write(temporary, "x", frame, 0)
+            _append(temporary, frame, 0)
+        return
+    size = path.stat().st_size
+    try:
+        _append(path, frame, step)
+    except OSError as error:
+        os.truncate(path, size)
+        if error.errno:
+            error.filename = str(path)
+        raise
 
 
 def write_trajectory(
@@ -177,9 +167,7 @@ def write_trajectory(
         axis or do not fit the flow, the strain does not increase by at least one time step from
         frame to frame, or a frame averages forces beyond the next one.
     """
-    if not isinstance(path, (str, os.PathLike)):
-        raise InputError(f"path must be a file name, not {short_repr(path)}.")
-    path = Path(path)
+    path = _as_path(path)
     check_trajectory(path)
     if path.exists() and not overwrite:
         raise InputError(
@@ -192,13 +180,11 @@ def write_trajectory(
         )
     strains = np.asarray(strain, np.float64)
     if strains.shape != np.shape(states.side):
-        raise InputError(
-            f"strain must have one number for each of the {np.size(states.side)} states."
-        )
+        raise InputError(f"strain must have one number for each of the {len(states)} states.")
     steps = steps_of_strain(flow, strains - strains[0])
     if not np.all(np.diff(steps) >= 1):
         raise InputError("strain must increase by at least one time step from frame to frame.")
-    frames = [jax.tree.map(lambda x, k=k: x[k], states) for k in range(len(steps))]
+    frames = [states[k] for k in range(len(states))]
     for state in frames:
         require_state(flow, state)
     numerics = checked_numerics(solver, None)
@@ -207,110 +193,74 @@ def write_trajectory(
         accepted = f"above 0 and at most the strain between frames, {least:g}"
         require_number("force_strain", force_strain, lambda x: (x > 0) & (x <= least), accepted)
     with atomic_write(path) as temporary:
-        for k, (state, step) in enumerate(zip(frames, steps.astype(int).tolist(), strict=True)):
-            frame = snapshots_from(flow, numerics, state, force_strain or 0.0)
-            _write(temporary, "r+" if k else "x", frame, step)
+        for state, step in zip(frames, steps.astype(int).tolist(), strict=True):
+            _append(temporary, snapshots_from(flow, numerics, state, force_strain or 0.0), step)
 
 
-def _library() -> tuple[Any, Any]:
-    """The file layer and the HOOMD schema of the GSD library, imported on first use."""
-    return import_module("gsd.fl"), import_module("gsd.hoomd")
+def _as_path(path: str | os.PathLike) -> Path:
+    if not isinstance(path, (str, os.PathLike)):
+        raise refused("path", path, "must be a file name")
+    return Path(path)
 
 
-def _write(path: Path, mode: str, frame: Snapshot, step: int) -> None:
-    fl, hoomd = _library()
-    with fl.open(
-        str(path), mode, application="jaxgran", schema="hoomd", schema_version=_SCHEMA_VERSION
-    ) as file:  # closing it after every frame flushes it
-        hoomd.HOOMDTrajectory(file).append(_gsd_frame(frame, step))
-
-
-def _gsd_frame(seen: Snapshot, step: int):
-    """A snapshot, or the first of a series with the mean forces of all, as a frame of the GSD
-    library.
+def _append(path: Path, snapshots: Snapshot, step: int) -> None:
+    """Append the first of one or more snapshots, with the mean forces of all; step 0 is a new
+    file.
     """
-    _, hoomd = _library()
-    arrays = jax.tree.map(np.asarray, seen)
-    steps = arrays if arrays.state.side.ndim else jax.tree.map(lambda x: x[None], arrays)
-    first = steps[0]
-    state, side, tilt = first.state, first.state.side.item(), first.state.tilt.item()
-    timestep, shear_rate = first.timestep.item(), first.shear_rate.item()
-    pairs, forces = _mean_forces(steps)
-    frame = hoomd.Frame()
+    about: Any = {"application": "jaxgran", "schema": "hoomd", "schema_version": _SCHEMA_VERSION}
+    with gsd.fl.open(str(path), "r+" if step else "x", **about) as file:  # closing it flushes it
+        gsd.hoomd.HOOMDTrajectory(file).append(_gsd_frame(series(snapshots), step))
+
+
+def _gsd_frame(snapshots: Any, step: int) -> Any:
+    first, forces = snapshots[0], pair_forces(snapshots)
+    state, grains = first.state, first.state.grains
+    side, tilt, timestep, shear_rate = (
+        x.item() for x in (state.side, state.tilt, first.timestep, first.shear_rate)
+    )
+    count, bonds = len(grains.radii), forces.pairs
+    labels, sizes = cluster_labels(bonds[:, 0], bonds[:, 1], count)
+    frame: Any = gsd.hoomd.Frame()
     frame.configuration.step = step
     frame.configuration.dimensions = 2
     frame.configuration.box = [side, side, 0, tilt, 0, 0]
-    frame.particles.N = len(state.positions)
-    frame.particles.position = _in_space(centred(state.positions, side, tilt))
-    frame.particles.velocity = _in_space(state.velocities)
-    frame.particles.diameter = 2 * state.grains.radii
-    frame.particles.mass = state.grains.masses
-    frame.bonds.N = len(pairs)
+    frame.particles.N = count
+    frame.particles.position = np.pad(centred(state.positions, side, tilt), ((0, 0), (0, 1)))
+    frame.particles.velocity = np.pad(state.velocities, ((0, 0), (0, 1)))
+    frame.particles.diameter = 2 * grains.radii
+    frame.particles.mass = grains.masses
+    frame.bonds.N = len(bonds)
     frame.bonds.types = ["contact"]
-    frame.bonds.typeid = np.zeros(len(pairs), np.uint32)
-    frame.bonds.group = pairs
-    constants = (
-        {"exact_radius": state.grains.radii, "exact_mass": state.grains.masses} if step == 0 else {}
-    )
-    grain_log = {
-        **_by_grain(pairs, forces, len(state.positions)),
+    frame.bonds.typeid = np.zeros(len(bonds), np.uint32)
+    frame.bonds.group = bonds
+    of_grains = {
+        "contact_force": np.bincount(bonds.ravel(), np.repeat(forces.force, 2), minlength=count),
+        "cluster": labels.astype(np.uint32),
+        "cluster_size": sizes.astype(np.uint32),
         "exact_position": state.positions,
         "exact_velocity": state.velocities,
-        **constants,
+        **({} if step else {"exact_radius": grains.radii, "exact_mass": grains.masses}),
     }
-    flow_log = {
+    of_flow = {
         "side": state.side,
         "tilt": state.tilt,
         "strain": step * timestep * shear_rate,
         "timestep": timestep,
         "shear_rate": shear_rate,
-        "force_strain": len(steps) * timestep * shear_rate,
+        "force_strain": len(snapshots) * timestep * shear_rate,
         "restitution": np.asarray(first.restitution, np.float64),
         "format_version": FORMAT_VERSION,
     }
     frame.log = {
-        "bonds/force": forces,
-        **{f"particles/{name}": np.array(x) for name, x in grain_log.items()},  # writable copies
-        **{f"jaxgran/{name}": np.array([x]) for name, x in flow_log.items()},
+        "bonds/force": forces.force,
+        **{f"particles/{name}": np.array(x) for name, x in of_grains.items()},  # writable copies
+        **{f"jaxgran/{name}": np.array([x]) for name, x in of_flow.items()},
     }
     return frame
 
 
-def _mean_forces(steps: Snapshot) -> tuple[Int[np.ndarray, "bonds 2"], Float[np.ndarray, " bonds"]]:
-    """Pairs i < j in loaded contact at any of the time steps, and the means of their forces over
-    all of them.
-    """
-    time, slot = np.nonzero(steps.impulses > 0)
-    pairs = np.sort(
-        np.stack([steps.contacts.i[time, slot], steps.contacts.j[time, slot]], axis=-1), axis=-1
-    )
-    bonds, bond = np.unique(pairs, axis=0, return_inverse=True)
-    forces = np.asarray(steps.impulses[time, slot] / steps.timestep[time], np.float64)
-    return bonds, np.bincount(bond.ravel(), forces, minlength=len(bonds)) / len(steps.timestep)
-
-
-def _by_grain(
-    pairs: Int[np.ndarray, "bonds 2"], forces: Float[np.ndarray, " bonds"], grains: int
-) -> Chunks:
-    """Contact force and cluster of each grain."""
-    labels, sizes = cluster_labels(pairs[:, 0], pairs[:, 1], grains)
-    return {
-        "contact_force": np.bincount(pairs.ravel(), np.repeat(forces, 2), minlength=grains),
-        "cluster": labels.astype(np.uint32),
-        "cluster_size": sizes.astype(np.uint32),
-    }
-
-
-def _in_space(vectors: Float[np.ndarray, "grains 2"]) -> Float[np.ndarray, "grains 3"]:
-    return np.pad(vectors, ((0, 0), (0, 1)))
-
-
 def read_trajectory(path: str | os.PathLike) -> Trajectory:
-    """Read a trajectory from a GSD file; one written by jaxgran is read back bit for bit.
-
-    A file of another program must have a square two-dimensional cell, sheared or not, with
-    positions and velocities, which are taken as peculiar. Missing diameters and masses are set to
-    one.
+    """Read a trajectory that jaxgran has written, bit for bit.
 
     Args:
       path: GSD file.
@@ -322,131 +272,39 @@ def read_trajectory(path: str | os.PathLike) -> Trajectory:
       InputError: (a ValueError) the file does not exist, is not such a trajectory, or has another
         version of the format; the message says why.
     """
-    if not isinstance(path, (str, os.PathLike)):
-        raise InputError(f"path must be a file name, not {short_repr(path)}.")
-    name = short_repr(os.fspath(path))
-    if not os.path.isfile(path):
+    path = _as_path(path)
+    name = short_repr(str(path))
+    if not path.is_file():
         raise InputError(f"there is no file {name}.")
     try:
-        frames = list(_frames(os.fspath(path)))
-    except InputError as reason:
-        if reason.field == "format_version":
-            raise
-        raise InputError(
-            f"{name} is not a trajectory of discs in a sheared cell: {reason}."
-        ) from None
+        with gsd.hoomd.open(path) as file:
+            frames = list(file)
+        version = frames[0].log.get("jaxgran/format_version", [None])[0] if frames else None
+        trajectory = _trajectory(frames) if version == FORMAT_VERSION else None
     except Exception as error:  # a damaged file may raise any exception
         reason = short_repr(str(error)).strip("'\"").rstrip(".")
         raise InputError(f"{name} is not a readable GSD file: {reason}.") from None
-    steps, numbers, states = zip(*frames, strict=True)
-    state = jax.tree.map(lambda *x: np.stack(x), *states)
-    areas = np.sum(np.pi * state.grains.radii[0] ** 2, dtype=np.float64)
+    if trajectory is None:
+        raise InputError(other_version(name, version, FORMAT_VERSION))
+    return trajectory
+
+
+def _trajectory(frames: Sequence[gsd.hoomd.Frame]) -> Trajectory:
+    def column(name: str) -> Any:
+        return np.stack([frame.log[name] for frame in frames])
+
+    radii, masses, positions, velocities = (
+        column(f"particles/exact_{x}") for x in ("radius", "mass", "position", "velocity")
+    )
+    side, tilt, strain, timestep, shear_rate, restitution = (
+        column(f"jaxgran/{x}")[:, 0]
+        for x in ("side", "tilt", "strain", "timestep", "shear_rate", "restitution")
+    )
+    area = np.sum(np.pi * radii[0] ** 2, dtype=np.float64)
     return Trajectory(
-        state,
-        np.array(steps),
-        np.array([frame["strain"] for frame in numbers]),
-        *(np.array(numbers[0][name]) for name in _NUMBERS[1:]),
-        packing_fraction=areas / np.asarray(state.side[0], np.float64) ** 2,
+        State(Grains(radii, masses), positions, velocities, side, tilt),
+        np.array([frame.configuration.step for frame in frames]),
+        strain,
+        *(np.array(x[0]) for x in (timestep, shear_rate, restitution)),
+        packing_fraction=area / np.asarray(side[0], np.float64) ** 2,
     )
-
-
-def _frames(path: str) -> Iterator[tuple[int, dict[str, float], State]]:
-    """Step, parameters and state of every frame; an InputError with a reason if something is
-    missing.
-    """
-    fl, _ = _library()
-    with fl.open(path, "r") as file:
-        if file.schema != "hoomd":
-            raise InputError(f"its schema must be hoomd, not {short_repr(file.schema)}")
-        if file.nframes == 0:
-            raise InputError("it has no frames")
-        first = _chunks(file, 0, {})
-        if f"{_EXACT}velocity" in first:  # jaxgran wrote it
-            found = first.get("log/jaxgran/format_version", [None])[0]
-            if difference := other_version(short_repr(path), found, FORMAT_VERSION):
-                raise InputError(difference, field="format_version")
-        if "particles/position" in first and file.find_matching_chunk_names("particles/velocity"):
-            at_rest = np.zeros_like(first["particles/position"])  # GSD does not store zeros
-            first.setdefault("particles/velocity", at_rest)
-        for k in range(file.nframes):
-            frame = _chunks(file, k, first)
-            if reason := _why_invalid(frame, first):
-                raise InputError(f"in frame {k} {reason}")
-            numbers = {
-                name: float(frame.get(f"log/jaxgran/{name}", [np.nan])[0]) for name in _NUMBERS
-            }
-            yield int(frame.get("configuration/step", [0])[0]), numbers, _state(frame)
-
-
-def _chunks(file: Any, frame: int, first: Chunks) -> Chunks:
-    """The chunks of a frame; missing ones default to those of the first frame."""
-    chunks = {
-        name: file.read_chunk(frame=frame, name=name)
-        for name in _READ
-        if file.chunk_exists(frame, name)
-    }
-    return {**first, **chunks}
-
-
-def _why_invalid(frame: Chunks, first: Chunks) -> str:
-    """The reason why a frame cannot become a State; "" if it can."""
-    grains, box = _grains(frame), frame.get("configuration/box", np.ones(6))
-    arrays = {
-        name: x
-        for name, x in frame.items()
-        if name.startswith("particles/") and name != "particles/N"
-    }
-    conditions = (
-        (grains > 0, "there are no grains"),
-        (grains == _grains(first), "the number of grains differs from that of the first frame"),
-        (frame.get("configuration/dimensions", [3])[0] == 2, "the cell has three dimensions"),
-        (box[0] == box[1] and box[0] > 0, "the cell is not a square"),
-        *(
-            (f"particles/{name}" in frame, f"there are no {meaning}")
-            for name, meaning in _NEEDED.items()
-        ),
-        (
-            all(len(x) == grains for x in arrays.values()),
-            "some array does not have one entry for each grain",
-        ),
-        (all(np.isfinite(x).all() for x in (box, *arrays.values())), "some number is not finite"),
-        *(
-            (np.all(frame.get(f"particles/{x}", 1) > 0), f"some {x} is not positive")
-            for x in ("diameter", "mass")
-        ),
-    )
-    return next((reason for holds, reason in conditions if not holds), "")
-
-
-def _grains(frame: Chunks) -> int:
-    """Number of grains."""
-    return int(frame.get("particles/N", [0])[0])
-
-
-def _state(frame: Chunks) -> State:
-    """The state of a frame, from the exact chunks if present, else from those of the GSD schema."""
-    grains = _grains(frame)
-    if f"{_EXACT}position" in frame:
-        radii, masses, positions, velocities = (
-            frame[f"{_EXACT}{name}"] for name in ("radius", "mass", "position", "velocity")
-        )
-        side, tilt = (frame[f"log/jaxgran/{name}"][0] for name in ("side", "tilt"))
-        if not len(radii) == len(masses) == len(positions) == len(velocities) == grains:
-            raise ValueError("its exact arrays do not have one entry for each grain")
-    else:
-        ones = np.ones(grains, np.float32)
-        radii, masses = frame.get("particles/diameter", ones) / 2, frame.get("particles/mass", ones)
-        side, tilt = (
-            frame["configuration/box"][0],
-            np.asarray(remap_tilt(jnp.asarray(frame["configuration/box"][3]))),
-        )
-        from_corner = jnp.asarray(frame["particles/position"][:, :2] + side / 2)
-        positions = np.asarray(wrap(from_corner, jnp.asarray(side), jnp.asarray(tilt)))
-        velocities = frame["particles/velocity"][:, :2]
-    parts: dict[str, Any] = {
-        "positions": positions,
-        "velocities": velocities,
-        "side": side,
-        "tilt": tilt,
-    }
-    return State(Grains(radii, masses), **parts)

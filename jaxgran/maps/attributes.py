@@ -130,10 +130,10 @@ def digest(values: Mapping[str, Any]) -> str:
 
 
 def first_difference(
-    here: Mapping[str, Any], there: Mapping[str, Any], but: Container[str] = ()
+    values: Mapping[str, Any], others: Mapping[str, Any], but: Container[str] = ()
 ) -> tuple[str, Any, Any] | None:
-    """The first name with another value there, and both values; None if there is none."""
-    for name, value in here.items():
-        if name not in but and there.get(name) != value:
-            return name, value, there.get(name)
+    """The first name with another value in ``others``, and both values; None if there is none."""
+    for name, value in values.items():
+        if name not in but and others.get(name) != value:
+            return name, value, others.get(name)
     return None

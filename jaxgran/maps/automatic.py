@@ -1,12 +1,15 @@
-"""What "auto" stands for: the grains that each point needs for an error, and a time step."""
+"""What "auto" stands for: the grains and the time step that a map needs for an error, at the least
+cost.
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
-from itertools import product
-from typing import Any
+from dataclasses import fields, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxgran.dynamics.batch import predicted_cost
+from jaxgran.maps.progress import duration
 from jaxgran.maps.settings import OPTIONS, MapSettings
 from jaxgran.maps.settings_checks import (
     FEWEST_STEPS,
@@ -16,12 +19,109 @@ from jaxgran.maps.settings_checks import (
     temperature_of,
 )
 from jaxgran.model.checks import InputError, refused, two_digits
-from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS
-from jaxgran.sampling.budget import SHARES, fewest_grains, size_error
-from jaxgran.sampling.timestep import automatic_timestep
+from jaxgran.model.choices import HALF_INTERVAL, MAX_GRAINS, MAX_REPLICAS
+from jaxgran.model.flow import ShearFlow
+from jaxgran.sampling.budget import sampling_target
+from jaxgran.sampling.correlation_strain import flow_correlation_strain
+from jaxgran.sampling.prediction import predicted
+from jaxgran.sampling.thresholds import (
+    LEAST_PREPARATION,
+    LEAST_SAMPLE,
+    LONGEST_CORRELATION_STRAINS,
+    LONGEST_STRAIN,
+    SAMPLE_CORRELATION_STRAINS,
+)
+from jaxgran.sampling.timestep import COARSE_TIMESTEP, automatic_timestep
 
 _AUTOMATIC_ERROR = 0.02  # of the stresses from an automatic time step, where no error is given
+_TIMESTEP_SHARE = 0.3  # of an error: short steps cost little
+# Shares of an error for sampling: where the other parts leave less than the first one, the error is
+# hardly reached, and the sample is for the second one.
+_LEAST_SAMPLING_SHARE, _SAMPLING_SHARE = 0.2, 0.5
+_WARMEST = 2.0  # temperature over the expected one
 _SAFE: dict[str, Any] = {"grains": 256, "timestep": 1e-6}  # all flows accept these for "auto"
+_SIZES = np.rint(256 * 2 ** np.arange(0, 20, 0.5)).astype(int)  # few, as each one is compiled
+_PREPARED = 3.3  # correlation strains until most flows are steady
+_SECONDS = 5e-7  # of processor time for a unit of ``predicted_cost``, at 1000 grains
+
+
+class Plan(NamedTuple):
+    """What every point of a map needs for an error.
+
+    =======  =======================================================================================
+    grains   number of grains
+    strain   strain of a sample
+    seconds  processor time of all seeds, infinite where the error is not reached
+    =======  =======================================================================================
+    """
+
+    grains: np.ndarray
+    strain: np.ndarray
+    seconds: np.ndarray
+
+
+def cheapest(settings: MapSettings, error: float) -> Plan:
+    """The numbers of grains (points,) that reach an error at the least cost."""
+    plans = plans_of_sizes(settings, error, _SIZES[_SIZES <= MAX_GRAINS])
+    best = np.argmin(plans.seconds, axis=1)
+    return Plan(*(x[np.arange(len(best)), best] for x in plans))
+
+
+def plans_of_sizes(settings: MapSettings, error: float, sizes: np.ndarray) -> Plan:
+    """What reaches an error with each number of grains, (points, sizes).
+
+    Of the error, time step and tolerance take what is given. The error of the size falls with N,
+    and sampling may take what is left. With few grains that is little, and averages scatter more,
+    so the sample is long. With many grains the preparation is long, as the correlation strain grows
+    as √N. Strain and cost are right within a factor of two or three.
+    """
+    flows = stack_of_any_size(settings.flows())
+    theory = predicted(flows, settings.size_classes(np.size(flows.restitution)))
+    averages = {
+        name: np.asarray(getattr(theory, name), float)[:, None]
+        for name in ("granular_temperature", "pressure", "shear_stress")
+    }
+    alpha, nu = (np.asarray(x)[:, None] for x in (flows.restitution, flows.packing_fraction))
+    area = np.pi / 4 * sizes / nu
+    correlation = flow_correlation_strain(averages, sizes, sizes, area, 1.0)
+    target = _targets(settings, error, flows, sizes)
+    # of the stresses in one correlation strain: a fit to the reference maps, within a factor of 1.5
+    scatter = 0.0245 * np.exp(0.85 * (1 - alpha)) * (sizes / 1600) ** -0.415
+    samples = np.where(target > 0, (scatter / np.maximum(target, 1e-9)) ** 2, np.inf)
+    least = 2 * np.maximum(LEAST_SAMPLE, SAMPLE_CORRELATION_STRAINS * correlation)
+    sampled = np.maximum(least, samples / settings.seeds * correlation)
+    longest = np.maximum(LONGEST_STRAIN, LONGEST_CORRELATION_STRAINS * correlation)
+    prepared = np.maximum(LEAST_PREPARATION, _PREPARED * correlation)
+    coarse = np.maximum(COARSE_TIMESTEP, np.asarray(flows.timestep))
+    strain_cost = _SECONDS * (sizes / 1000) ** 0.2 * sizes / flows.grains
+    seconds = strain_cost * (
+        prepared * predicted_cost(flows, coarse)[:, None] + sampled * predicted_cost(flows)[:, None]
+    )
+    seconds = np.where(sampled <= longest, settings.seeds * seconds, np.inf)
+    return Plan(np.broadcast_to(sizes, seconds.shape), sampled, seconds)
+
+
+def sampling_targets(settings: MapSettings, flows: ShearFlow) -> np.ndarray | None:
+    """The relative standard error (replicas,) that each seed of some points is sampled to; None
+    without an error.
+    """
+    if settings.error is None:
+        return None
+    left = _targets(settings, settings.error, flows, np.array([flows.grains]))[:, 0]
+    error = settings.error / HALF_INTERVAL
+    target = np.where(left > _LEAST_SAMPLING_SHARE * error, left, _SAMPLING_SHARE * error)
+    return target * np.sqrt(settings.seeds)
+
+
+def _targets(
+    settings: MapSettings, error: float, flows: ShearFlow, sizes: np.ndarray
+) -> np.ndarray:
+    """``sampling_target`` (points, sizes) of some points, with room for warmer flows."""
+    alpha, nu, timestep = (
+        np.asarray(x)[:, None] for x in (flows.restitution, flows.packing_fraction, flows.timestep)
+    )
+    crossing = timestep * np.sqrt(_WARMEST * temperature_of(settings, flows))[:, None]
+    return sampling_target(error, alpha, nu, sizes, crossing, settings.solver.tolerance)
 
 
 def chosen_settings(parameters: Mapping[str, Any]) -> tuple[MapSettings, str]:
@@ -34,8 +134,8 @@ def chosen_settings(parameters: Mapping[str, Any]) -> tuple[MapSettings, str]:
         where it has tuples. What is no field of it is ignored.
 
     Raises:
-      InputError: (a ValueError) a parameter is out of its range, or the error needs too many
-        grains.
+      InputError: (a ValueError) a parameter is out of its range, or no number of grains reaches the
+        error.
     """
     plain = _plain_settings(parameters)
     if plain.get("strain") is not None and plain.get("error") is not None:
@@ -49,36 +149,57 @@ def chosen_settings(parameters: Mapping[str, Any]) -> tuple[MapSettings, str]:
     checked = MapSettings(**{**plain, **safe, "strain": None})
     in_order = ("restitution", "packing_fraction", "grains_by_point")
     chosen = plain | {name: getattr(checked, name) for name in in_order}
+    target = _AUTOMATIC_ERROR if checked.error is None else _TIMESTEP_SHARE * checked.error
+    aim = f"{target:g} from the time step" if checked.error is None else f"{checked.error:g}"
     notes = []
+    if "timestep" in automatic:
+        chosen["timestep"], point = _timestep_for(checked, target, plain.get("strain"))
+        notes = [f"timestep {chosen['timestep']:g} / shear rate, which {point} needs"]
     if "grains" in automatic:
         if checked.error is None:
             raise InputError("`grains='auto'` requires `error`.", field="grains", value="auto")
-        by_point = _grains_for(checked, checked.error)
+        timestep = chosen.get("timestep", checked.timestep)
+        plan = _plan(replace(checked, timestep=timestep), checked.error)
+        of_flow = plan.grains.reshape(len(checked.timesteps), -1).max(axis=0)
+        by_point = (*of_flow.tolist(),) * len(checked.timesteps)  # dt compare at one N
         chosen |= {"grains": max(by_point), "grains_by_point": by_point}
-        sizes = " to ".join(str(size) for size in sorted({min(by_point), max(by_point)}))
-        notes.append(f"{sizes} grains, {checked.seeds} seed{'s' if checked.seeds > 1 else ''}")
-    target = _AUTOMATIC_ERROR if checked.error is None else SHARES["timestep"] * checked.error
-    if "timestep" in automatic:
-        chosen["timestep"], point = _timestep_for(checked, target, plain.get("strain"))
-        notes.append(f"timestep {chosen['timestep']:g} / shear rate, which {point} needs")
-    aim = f"{target:g} from the time step" if checked.error is None else f"{checked.error:g}"
+        notes = [
+            f"{_range(plan.grains)} grains, {checked.seeds} seed{'s' if checked.seeds > 1 else ''}",
+            *notes,
+            f"strains of about {_range(plan.strain)} for each seed",
+            f"{_time(plan.seconds.sum())} of processor time",
+        ]
     sentence = f"{'; '.join(notes)}: for a relative error of {aim} in the stresses."
     return MapSettings(**chosen), sentence
 
 
-def _grains_for(settings: MapSettings, error: float) -> tuple[int, ...]:
-    """The number of grains that each point needs for its share of an error."""
-    points = list(product(settings.packing_fraction, settings.restitution))
-    grains = [fewest_grains(alpha, nu, SHARES["size"] * error) for nu, alpha in points]
-    if max(grains) > MAX_GRAINS:
-        surely = MAX_GRAINS / 2**0.5  # numbers of grains are chosen in steps of √2
-        least = max(float(size_error(alpha, nu, surely)) for nu, alpha in points) / SHARES["size"]
+def _plan(settings: MapSettings, error: float) -> Plan:
+    """``cheapest``; InputError where nothing reaches the error."""
+    plan = cheapest(settings, error)
+    if not np.isfinite(plan.seconds).all():
+        worst = int(np.argmax(plan.seconds))
+        where = point_text(stack_of_any_size(settings.flows()), worst)
         reason = (
-            f"must be at least {two_digits(least, up=True)} at these points, to need at most "
-            f"{MAX_GRAINS} grains"
+            f"is out of reach at {where} with up to {MAX_GRAINS} grains; take a larger one, more "
+            "seeds or a shorter time step"
         )
         raise refused("error", error, reason)
-    return tuple(grains) * len(settings.timesteps)
+    return plan
+
+
+def _range(numbers: np.ndarray) -> str:
+    """The least and the largest number, with two digits unless they are whole."""
+    exact = numbers.dtype.kind == "i"
+    ends = sorted({*map(str if exact else _rounded, (numbers.min(), numbers.max()))}, key=float)
+    return " to ".join(ends)
+
+
+def _time(seconds: float) -> str:
+    return f"about {duration(seconds)}" if seconds > 10 else "a few seconds"
+
+
+def _rounded(number: float) -> str:
+    return f"{float(f'{number:.2g}'):g}"
 
 
 def _timestep_for(settings: MapSettings, error: float, strain: Any) -> tuple[float, str]:

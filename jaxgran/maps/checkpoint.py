@@ -4,11 +4,11 @@ complete.
 ==================  ================================================================================
 file                content
 ==================  ================================================================================
-``settings.nc``     all that the numbers of a replica depend on but its ``ReplicaId``: settings,
+``settings.npz``    all that the numbers of a replica depend on but its ``ReplicaId``: settings,
                     versions, sources, precision and device
-``replica-*.nc``    a finished replica, named after its ``ReplicaId``
-``journal-*.nc``    a batch that is running, see ``journal``, named after its first replica; the end
-                    of the name is a hash of what ``settings.nc`` has
+``replica-*.npz``   a finished replica, named after its ``ReplicaId``
+``journal-*.npz``   a batch that is running, see ``journal``, named after its first replica; the end
+                    of the name is a hash of what ``settings.npz`` has
 ``lock``            locked by the process that writes here; released when that process ends for any
                     reason
 ==================  ================================================================================
@@ -22,7 +22,7 @@ import glob
 import os
 import shutil
 from collections.abc import Mapping, Sequence
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,8 @@ import numpy as np
 
 from jaxgran.dynamics.tally import TABLE, flat_tally, tally_from_flat
 from jaxgran.environment import default_device, precision
-from jaxgran.files import is_lock_of, lock_folder
-from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
+from jaxgran.files import is_locked, lock_file
+from jaxgran.io.arrays import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps.attributes import digest, first_difference, identity_of_replicas
 from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.own_observables import sums_by_name
@@ -66,6 +66,7 @@ class Checkpoint:
 
     def __init__(self, output: Path, settings: MapSettings, resume: bool):
         self.folder = checkpoint_folder(output)
+        self._settings_path, self._lock_path = self.folder / "settings.npz", self.folder / "lock"
         self.settings, self._output = settings, output
         self.done: dict[Key, Replica] = {}
         self.interrupted: list[list[Key]] = []
@@ -74,7 +75,7 @@ class Checkpoint:
         self._ids = dict(zip(keys, replica_ids(settings, keys), strict=True))
         self._identity = _identity(settings)
         self._digest = digest(self._identity)
-        self._lock = _locked(self.folder, output)
+        self._lock = self._new_lock()
         try:
             self._remove_leftovers()
             self._begin(resume)
@@ -88,8 +89,8 @@ class Checkpoint:
             self._write(replicas)
         except FileNotFoundError:  # the folder was removed by hand
             self._unlock()
-            self._lock = _locked(self.folder, self._output)
-            self._write_settings()
+            self._lock = self._new_lock()
+            write_arrays(self._settings_path, {}, self._identity)
             self._write({**self.done, **replicas})
         self.done |= replicas
         self.journal_path(list(replicas)).unlink(missing_ok=True)
@@ -100,55 +101,40 @@ class Checkpoint:
 
         So a worker of an earlier map that still writes here writes no file of this one.
         """
-        return self.folder / f"journal-{_name(self._ids[keys[0]])}-{self._digest}.nc"
+        return self.folder / f"journal-{_name(self._ids[keys[0]])}-{self._digest}.npz"
 
     def close(self, finished: bool) -> None:
         """Release the lock, and remove the files of this map if it is finished, and the folder if
         it has no others.
         """
-        if is_lock_of(self.folder, self._lock):
-            if finished:
-                for key in self._ids:
-                    self._path(key).unlink(missing_ok=True)
-            if not self._files(self._digest):
-                self._remove_folder()
+        if is_locked(self._lock_path, self._lock):
+            replicas = {self._path(key) for key in self._ids} if finished else set()
+            if replicas.issuperset(self._files(self._digest)):
+                self._settings_path.unlink(missing_ok=True)  # first: without it there is no map
+                shutil.rmtree(self.folder, ignore_errors=True)
+            for path in replicas:
+                path.unlink(missing_ok=True)
         self._unlock()
 
-    def _remove_folder(self) -> None:
-        try:  # renamed in one operation, so that the next run finds the whole folder or none
-            os.replace(self.folder, self._discarded)
-        except OSError:
-            shutil.rmtree(self.folder, ignore_errors=True)
-        shutil.rmtree(self._discarded, ignore_errors=True)
-
-    @property
-    def _discarded(self) -> Path:
-        """Name of the folder while it is being removed."""
-        return self.folder.with_name(f".{self.folder.name}")
-
     def _remove_leftovers(self) -> None:
-        """Remove temporary files of a process that was killed while it wrote or removed files."""
-        shutil.rmtree(self._discarded, ignore_errors=True)
+        """Remove temporary files of a process that was killed while it wrote."""
         unique = "[0-9a-f]" * 16
-        beside = self._output.parent.glob(
-            f".{glob.escape(self._output.stem)}-{unique}{self._output.suffix}"
-        )
-        for path in [*beside, *self.folder.glob(f".*-{unique}.nc")]:
+        beside = f".{glob.escape(self._output.stem)}-{unique}{self._output.suffix}"
+        for path in [*self._output.parent.glob(beside), *self.folder.glob(f".*-{unique}.npz")]:
             path.unlink(missing_ok=True)
 
     def _begin(self, resume: bool) -> None:
         """Read the unfinished map that is there, or write the settings of a new one."""
-        path = self.folder / "settings.nc"
         try:
-            begun = read_arrays(path)[1] if path.exists() else {}
+            begun = read_arrays(self._settings_path)[1] if self._settings_path.exists() else {}
         except CorruptFile:
             raise InputError(
-                f"the file settings.nc in {str(self.folder)!r} is damaged: remove the folder."
+                f"the file settings.npz in {str(self.folder)!r} is damaged: remove the folder."
             ) from None
         if not (begun and self._files(digest(begun))):
-            for path in self.folder.glob("*.nc"):
+            for path in self.folder.glob("*.npz"):
                 path.unlink()
-            self._write_settings()
+            write_arrays(self._settings_path, {}, self._identity)
             return
         if not resume:
             raise InputError(
@@ -157,43 +143,42 @@ class Checkpoint:
                 field="output",
             )
         if difference := first_difference(self._identity, begun):
-            name, here, there = difference
+            name, requested, begun_with = difference
             raise InputError(
-                f"the unfinished map in {str(self.folder)!r} has {name} {there!r}, not {here!r}: "
-                "resume it with the same parameters, or remove the folder."
+                f"the unfinished map in {str(self.folder)!r} has {name} {begun_with!r}, not "
+                f"{requested!r}: resume it with the same parameters, or remove the folder."
             )
         self._read()
 
     def _files(self, digest: str) -> list[Path]:
         """The replicas and journals of a map."""
-        patterns = "replica-*.nc", f"journal-*-{digest}.nc"
+        patterns = "replica-*.npz", f"journal-*-{digest}.npz"
         return sorted(path for pattern in patterns for path in self.folder.glob(pattern))
 
     def _path(self, key: Key) -> Path:
-        return self.folder / f"replica-{_name(self._ids[key])}.nc"
+        return self.folder / f"replica-{_name(self._ids[key])}.npz"
 
     def _read(self) -> None:
         """Read the replicas of this map, and which of its batches have a journal."""
-        there = {path.name for path in self.folder.iterdir()}
+        files = set(self.folder.iterdir())
         own_sums = sums_by_name(self.settings)
         for key, replica in self._ids.items():
             path = self._path(key)
-            if path.name in there and (content := self._content(path)):
+            if path in files and (content := self._content(path)):
                 self.done[key] = _replica_of(replica.grains, own_sums, *content)
         keys: dict[tuple, Key] = {replica: key for key, replica in self._ids.items()}
-        started: set[Key] = set()
-        for path in sorted(self.folder.glob(f"journal-*-{self._digest}.nc")):
+        for path in sorted(self.folder.glob(f"journal-*-{self._digest}.npz")):
             if content := self._content(path):
-                replicas = [tuple(numbers) for numbers in content[0]["replicas"].tolist()]
+                replicas = list(map(tuple, content[0]["replicas"].tolist()))
                 batch = [keys[replica] for replica in replicas if replica in keys]
-                if len(batch) < len(replicas) or started & set(batch):
+                if len(batch) < len(replicas) or set(batch) & set(chain(*self.interrupted)):
                     continue  # also of other points, or of another batch
                 if self.done.keys() >= set(batch):  # the run ended before it removed the journal
                     path.unlink(missing_ok=True)
-                    continue
-                self.interrupted.append(batch)
-                started |= set(batch)
-        self.done = {key: x for key, x in self.done.items() if key not in started}
+                else:
+                    self.interrupted.append(batch)
+        for key in chain(*self.interrupted):
+            self.done.pop(key, None)
 
     def _content(self, path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
         """The content of a file; None where it was damaged, and is removed."""
@@ -208,8 +193,21 @@ class Checkpoint:
         for key, replica in replicas.items():
             write_arrays(self._path(key), *_content_of(replica))
 
-    def _write_settings(self) -> None:
-        write_arrays(self.folder / "settings.nc", {}, self._identity)
+    def _new_lock(self) -> int | None:
+        """The lock of the folder, made if missing; InputError if another process has it."""
+        try:
+            return lock_file(self._lock_path, wait=False)
+        except FileExistsError:
+            raise InputError(
+                f"output needs the folder {str(self.folder)!r}, and a file has this name: "
+                "rename it.",
+                field="output",
+            ) from None
+        except BlockingIOError:
+            raise InputError(
+                f"another process is writing {str(self._output)!r}: wait for it, or choose "
+                "another `output`."
+            ) from None
 
     def _unlock(self) -> None:
         if self._lock is not None:
@@ -259,18 +257,3 @@ def _identity(settings: MapSettings) -> dict[str, Any]:
         "device": default_device().platform,
         "number of running sums": len(TABLE),
     }
-
-
-def _locked(folder: Path, output: Path) -> int | None:
-    """The lock of a folder, made if missing; InputError if another process has it."""
-    try:
-        return lock_folder(folder)
-    except FileExistsError:
-        raise InputError(
-            f"output needs the folder {str(folder)!r}, and a file has this name: rename it.",
-            field="output",
-        ) from None
-    except BlockingIOError:
-        raise InputError(
-            f"another process is writing {str(output)!r}: wait for it, or choose another `output`."
-        ) from None

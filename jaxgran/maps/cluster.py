@@ -55,7 +55,7 @@ def run_on_cluster(
             f"no scheduler answers at {address!r}: {' '.join(str(error).split())[:80]}."
         ) from None
     x64, caching = precision() == "float64", programs_folder() is not None
-    here = versions_of(made_with())
+    versions = versions_of(made_with())
     with client:
         # Not ``client.get_executor()``: a future of it whose result is on its way when the
         # scheduler dies never ends.
@@ -68,7 +68,7 @@ def run_on_cluster(
         for future in as_completed(list(futures), loop=client.loop):
             number = futures.pop(future)
             try:
-                there, result = future.result()
+                of_worker, result = future.result()
             except KilledWorker:
                 yield number, None
                 continue
@@ -76,20 +76,20 @@ def run_on_cluster(
                 # without the tracebacks of its attempts to connect again
                 logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
                 raise ConnectionError(f"the scheduler at {address} has gone") from None
-            _require_versions(here, versions_of(there))
+            _require_versions(versions, versions_of(of_worker))
             if made is not None:
-                for name, value in there.items():
+                for name, value in of_worker.items():
                     made.setdefault(name, {})[value] = None
             yield number, result
 
 
-def _require_versions(here: Mapping[str, str], there: Mapping[str, str]) -> None:
+def _require_versions(versions: Mapping[str, str], of_worker: Mapping[str, str]) -> None:
     """Raise an InputError if a worker has other versions than this process."""
-    if difference := first_difference(there, here):
-        name, other, own = difference
+    if difference := first_difference(of_worker, versions):
+        name, other, required = difference
         raise InputError(
             "workers must have the versions of this process, and one has "
-            f"{name.removeprefix('version_')} {other!r}, not {own!r}."
+            f"{name.removeprefix('version_')} {other!r}, not {required!r}."
         )
 
 

@@ -13,7 +13,6 @@ import xarray as xr
 from jaxgran.dynamics.engine import select_engine, solver_in_use
 from jaxgran.maps.attributes import to_attrs
 from jaxgran.maps.batches import points_of_part
-from jaxgran.maps.confidence import confidence_variables
 from jaxgran.maps.conventions import CONVENTIONS, follow_conventions
 from jaxgran.maps.own_observables import own_variables
 from jaxgran.maps.point_values import PointValues
@@ -35,10 +34,10 @@ def map_dataset(
     """The data of the finished replicas; points without any are NaN with the status ``not_run`` or
     ``failed``.
 
-    Its variables and coordinates are the rows of ``maps.variables``; with them are the intervals of
-    ``confidence_variables`` and, with the setting ``observe``, ``own_variables``. A point is
-    (packing_fraction, restitution). If the settings have a list of numbers of grains or of time
-    steps, the dimensions grains and timestep come before these.
+    Its variables and coordinates are the rows of ``maps.variables``, and with the setting
+    ``observe`` also ``own_variables``. A point is (packing_fraction, restitution). If the settings
+    have a list of numbers of grains or of time steps, the dimensions grains and timestep come
+    before these.
 
     Args:
       settings: the map.
@@ -48,12 +47,10 @@ def map_dataset(
         also what ran, where that is not what this process would take.
     """
     points = PointValues(settings, replicas)
-    grid, averages = points.grid, points.averages
     groups: dict[str, dict[str, xr.Variable]] = defaultdict(dict)
     for row in VARIABLES:
         groups[row.group].update(row.on(points))
-    groups["/"] |= confidence_variables(grid, averages, settings.solver.tolerance)
-    groups["/"] |= own_variables(settings, grid, averages.samples)
+    groups["/"] |= own_variables(settings, points.grid, points.averages.samples)
     coordinates = _coordinates(points)
     tree = {
         group: follow_conventions(xr.Dataset(variables, coordinates.get(group)))

@@ -18,11 +18,11 @@ from jaxtyping import Array
 
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.tally import Tally, flat_tally, tally_from_flat
-from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
+from jaxgran.io.arrays import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps.replica import ReplicaId
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
-from jaxgran.sampling.observe import Observable, ObserveBatch, observed_shapes
+from jaxgran.sampling.observe import Observe, ObserveBatch, observed_shapes
 
 SECONDS = 5.0  # shortest time between two writes of a journal
 WRITING_SHARE = 0.05  # largest share of the time that is spent on writing
@@ -59,15 +59,14 @@ class Journal:
         numerics: Numerics,
         state: State,
         steps: Array | np.ndarray,
-        observe: Observable | None = None,
+        observe: Observe | None = None,
     ) -> tuple[State, Tally]:
         k, self.position = self.position, self.position + 1
         if k < len(self.tallies):
-            if np.array_equal(self.steps[k], steps):
-                return self._repeated(
-                    k, state, None if observe is None else observed_shapes(observe, flow)
-                )
-            raise CorruptFile(f"{self.path.name} is the journal of another run")
+            if not np.array_equal(self.steps[k], steps):
+                raise CorruptFile(f"{self.path.name} is the journal of another run")
+            observed = None if observe is None else observed_shapes(observe, flow)
+            return self._repeated(k, state, observed)
         state, tally = self.advance(flow, numerics, state, steps, observe)
         self.steps.append(np.asarray(steps))
         self.tallies.append(flat_tally(tally, np.shape(steps)))
@@ -88,18 +87,16 @@ class Journal:
 
     def _write(self) -> None:
         begun = time.monotonic()
-        states = {f"state_{k}": leaf for k, leaf in enumerate(self.leaves)}
-        most = max(
-            numbers.shape[-1] for numbers in self.tallies
-        )  # with a user's sums in those of the sample
-        tallies = [
-            np.pad(numbers, ((0, 0), (0, most - numbers.shape[-1]))) for numbers in self.tallies
-        ]
-        series = {"steps": np.stack(self.steps), "tallies": np.stack(tallies)}
-        with suppress(
-            FileNotFoundError
-        ):  # the folder was removed; ``Checkpoint.add`` makes it again
-            write_arrays(self.path, {"replicas": self.replicas, **series, **states}, {})
+        longest = max(x.shape[-1] for x in self.tallies)  # those of a sample have a user's sums too
+        tallies = [np.pad(x, ((0, 0), (0, longest - x.shape[-1]))) for x in self.tallies]
+        arrays = {
+            "replicas": self.replicas,
+            "steps": np.stack(self.steps),
+            "tallies": np.stack(tallies),
+            **{f"state_{k}": leaf for k, leaf in enumerate(self.leaves)},
+        }
+        with suppress(FileNotFoundError):  # ``Checkpoint.add`` makes a removed folder again
+            write_arrays(self.path, arrays, {})
         now = time.monotonic()
         self.next = now + max(SECONDS, min((now - begun) / WRITING_SHARE, _LONGEST_PAUSE))
 

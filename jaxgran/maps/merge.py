@@ -64,15 +64,16 @@ def merge_maps(
     """
     path = (str, os.PathLike)
     is_list = isinstance(maps, (list, tuple)) and len(maps) > 0
-    if not is_list or not all(isinstance(one, (*path, xr.DataTree)) for one in maps):
+    if not is_list or not all(isinstance(source, (*path, xr.DataTree)) for source in maps):
         raise InputError(
             f"maps must be a list of at least one map or file, not {short_repr(maps)}."
         )
     names = [
-        short_repr(str(one)) if isinstance(one, path) else f"map {k}" for k, one in enumerate(maps)
+        short_repr(str(source)) if isinstance(source, path) else f"map {k}"
+        for k, source in enumerate(maps)
     ]
-    opened = [open_map(one) if isinstance(one, path) else one for one in maps]
-    chosen = [from_attrs(one) for one in opened]
+    opened = [open_map(source) if isinstance(source, path) else source for source in maps]
+    chosen = [from_attrs(data) for data in opened]
     _require_same(names, chosen, opened)
     method: Any = chosen[0]["solver"] if solver is None else solver
     text = identity_of_replicas(chosen[0])["solver"]
@@ -80,7 +81,9 @@ def merge_maps(
         raise InputError(f"solver must be that of the maps, which is {text}.")
     given = {"observe": observe, "solver": method}
     with jax.enable_x64(opened[0].attrs["precision"] == "float64"):
-        return _union([MapSettings(**{**one, **given}) for one in chosen], chosen, opened)
+        return _union(
+            [MapSettings(**{**parameters, **given}) for parameters in chosen], chosen, opened
+        )
 
 
 def _require_same(
@@ -91,7 +94,7 @@ def _require_same(
     for settings, data in zip(chosen, maps, strict=True):
         of_run = {name: data.attrs.get(name) for name in _EQUAL}
         compared.append(identity_of_replicas(settings) | of_run)
-        if any("grains_by_point" in one for one in chosen):
+        if any("grains_by_point" in parameters for parameters in chosen):
             compared[-1] |= {name: settings.get(name) for name in AXES}
     for name, values in zip(names, compared, strict=True):
         if difference := first_difference(compared[0], values):
@@ -112,20 +115,20 @@ def _union(
         raise InputError(
             f"observe must be the function of the maps, which is {chosen[0].get('observe')}."
         )
-    found: dict[ReplicaId, Replica | None] = {}
+    by_id: dict[ReplicaId, Replica | None] = {}
     for part, data in zip(parts, maps, strict=True):
         replicas = replicas_of(data, part)
-        for name, replica in zip(replica_ids(part, replicas), replicas.values(), strict=True):
-            found[name] = found.get(name) or replica
+        for replica_id, replica in zip(replica_ids(part, replicas), replicas.values(), strict=True):
+            by_id[replica_id] = by_id.get(replica_id) or replica
     keys = list(np.ndindex(len(settings.flows()), settings.seeds))
-    names = replica_ids(settings, keys)
-    merged = {key: found[name] for key, name in zip(keys, names, strict=True) if name in found}
+    ids = dict(zip(keys, replica_ids(settings, keys), strict=True))
+    merged = {key: by_id[ids[key]] for key in keys if ids[key] in by_id}
     return map_dataset(settings, merged, _attributes(maps))
 
 
 def _union_of_settings(parts: Sequence[MapSettings]) -> MapSettings:
     """The settings with all values of the axes and all seeds."""
-    seeds = {one.first_seed + seed for one in parts for seed in range(one.seeds)}
+    seeds = {part.first_seed + seed for part in parts for seed in range(part.seeds)}
     if missing := {*range(min(seeds), max(seeds))} - seeds:
         raise InputError(
             f"the seeds of the maps must follow one another, and seed {min(missing)} is missing."
@@ -137,9 +140,9 @@ def _union_of_settings(parts: Sequence[MapSettings]) -> MapSettings:
         )
     axes: dict[str, Any] = {}
     for name in ("restitution", "packing_fraction", "grains", "timestep"):
-        lists = [np.atleast_1d(getattr(one, name)).tolist() for one in parts]
+        lists = [np.atleast_1d(getattr(part, name)).tolist() for part in parts]
         values = list(dict.fromkeys(chain(*lists)))
-        is_list = any(isinstance(getattr(one, name), tuple) for one in parts)
+        is_list = any(isinstance(getattr(part, name), tuple) for part in parts)
         axes[name] = tuple(values) if is_list or len(values) > 1 else values[0]
     seeds_of_all = {"first_seed": min(seeds), "seeds": len(seeds), "part": None}
     return replace(parts[0], **axes, **seeds_of_all)
@@ -151,9 +154,9 @@ def _attributes(maps: Sequence[xr.DataTree]) -> dict[str, Any]:
         str(name): value for name, value in maps[0].attrs.items() if name not in _LEFT_OUT
     }
     for name, value in attributes.items():
-        values = [one.attrs.get(name) for one in maps]
+        values = [data.attrs.get(name) for data in maps]
         if name in _SUMMED:
             attributes[name] = sum(filter(None, values))
         elif isinstance(value, str):
-            attributes[name] = "; ".join(dict.fromkeys(str(one) for one in values))
+            attributes[name] = "; ".join(dict.fromkeys(map(str, values)))
     return attributes | {"command": "jaxgran.merge_maps"}

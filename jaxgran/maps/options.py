@@ -51,8 +51,8 @@ class Option:
         if isinstance(self.kind, tuple):
             return "|".join(self.kind)
         kinds: dict[type, str] = {float: "NUMBER", int: "INTEGER", Path: "FILE"}
-        one = self.example or kinds.get(self.kind, "TEXT")
-        return ("LIST" if self.several or self.values else one) + ("|auto" if self.auto else "")
+        word = self.example or kinds.get(self.kind, "TEXT")
+        return ("LIST" if self.several or self.values else word) + ("|auto" if self.auto else "")
 
 
 def option(value: Any, help: str, kind: type | tuple[str, ...] = float, **about: Any) -> Any:

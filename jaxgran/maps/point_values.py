@@ -17,8 +17,10 @@ from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.states import first_of_points, state_values
 from jaxgran.maps.sums import sum_variables
 from jaxgran.model.status import Status
+from jaxgran.sampling.budget import Estimate, large_system
 from jaxgran.sampling.enskog_factors import measured_over_enskog
 from jaxgran.sampling.prediction import kinetic_theory
+from jaxgran.sampling.sample import ERROR_OBSERVABLES
 
 _LARGEST = 1e12  # a prediction above it has no steady state
 
@@ -47,7 +49,30 @@ class PointValues:
     def status(self) -> np.ndarray:
         """The worst of all seeds, and of their samples together."""
         drifting = np.where(self.averages.drifting, Status.not_steady, NOT_RUN)
-        return np.maximum(worst_status(self.statuses), drifting).astype(np.int8)
+        imprecise = np.where(self._is_imprecise, Status.imprecise, NOT_RUN)
+        return np.maximum.reduce([worst_status(self.statuses), drifting, imprecise]).astype(np.int8)
+
+    @property
+    def _is_imprecise(self) -> np.ndarray:
+        """Whether an average of a large system has a larger error than the requested one."""
+        if self.settings.error is None:
+            return np.zeros(len(self.grid.flows), bool)
+        wanted = (self.large_system[name] for name in ERROR_OBSERVABLES)
+        return np.any([x.total > self.settings.error * np.abs(x.value) for x in wanted], axis=0)
+
+    @cached_property
+    def large_system(self) -> dict[str, Estimate]:
+        """The averages of a large system, with the errors by source."""
+        flows = self.grid.batch
+        return large_system(
+            self.averages.values,
+            self.averages.stderrs,
+            flows.restitution,
+            flows.packing_fraction,
+            self.grid.grains,
+            flows.timestep,
+            self.settings.solver.tolerance,
+        )
 
     @cached_property
     def strains(self) -> tuple[np.ndarray, np.ndarray]:

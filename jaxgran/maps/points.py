@@ -94,8 +94,9 @@ def point_averages(settings: MapSettings, replicas: Mapping[Key, Replica | None]
         for name in OBSERVABLES:
             averages.values[name][point] = values[name]
             averages.stderrs[name][point] = stderrs[name]
-        mass = _mass(settings, flow)
         area, shear_rate = samples[0].area, samples[0].shear_rate
+        # of the grains, which is the sum of their squared diameters
+        mass = 4 / np.pi * float(flow.packing_fraction) * area
         strain = averages.correlation_strain[point] = flow_correlation_strain(
             values, flow.grains, mass, area, shear_rate
         )
@@ -104,16 +105,6 @@ def point_averages(settings: MapSettings, replicas: Mapping[Key, Replica | None]
         for name in scalars:
             averages.observable_correlation[name][point] = independent[name]
     return averages
-
-
-def _mass(settings: MapSettings, flow: ShearFlow) -> float:
-    """The mass of all grains of a flow, in m."""
-    grains = settings.grains_of(flow.grains, 1)
-    return (
-        flow.grains * (1 + float(flow.polydispersity) ** 2 / 3)
-        if grains is None
-        else float(grains.masses.sum())
-    )
 
 
 def _samples(

@@ -1,17 +1,6 @@
-"""What a map starts from: a preset or a file, replaced by the parameters that are given and by what
-these imply.
+"""The presets: parameters that a map starts from, by name."""
 
-This module loads neither JAX nor xarray at once, as the help of the command line needs the names of
-the presets.
-"""
-
-import os
-import warnings
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
-
-from jaxgran.model.checks import InputError, refused
 
 PRESETS: dict[str, dict[str, Any]] = {
     "quick": {
@@ -37,61 +26,3 @@ PRESETS: dict[str, dict[str, Any]] = {
         "strain": 16.0,
     },
 }
-
-_REPLACED = {
-    "error": ("seeds", "strain"),
-    "strain": ("error",),
-    "polydispersity": ("diameters",),
-    "diameters": ("polydispersity",),
-}
-_OF_POINTS = {"grains", "timestep", "restitution", "packing_fraction", "error"}
-_OF_ERROR = {"grains": "auto", "timestep": "auto", "seeds": 1}
-"""What an error implies; a longer sample is cheaper than a second seed."""
-
-
-def with_start(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters of ``ratio_map``: those given, on top of those of a preset or of a file.
-
-    Raises:
-      InputError: (a ValueError) there is no such preset or map, or both are given.
-    """
-    preset, from_map = given.get("preset", "quick"), given.get("from_map")
-    if not isinstance(preset, str) or preset not in PRESETS:
-        *others, last = PRESETS
-        raise refused("preset", preset, f"must be {', '.join(others)} or {last}")
-    if from_map is None:
-        return combined(PRESETS[preset], given)
-    if "preset" in given:
-        raise InputError("`preset` and `from_map` exclude each other.", field="preset")
-    if not isinstance(from_map, (str, os.PathLike)):
-        raise refused("from_map", from_map, "must be a file name")
-    return combined(_parameters_of(Path(from_map)), given)
-
-
-def combined(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters of a preset or a file, replaced by those that are given and by what these
-    imply.
-    """
-    named = {name for name, value in given.items() if value is not None}
-    replaced = {name for option in _REPLACED.keys() & named for name in _REPLACED[option]}
-    kept = {name: value for name, value in start.items() if name not in replaced}
-    if "grains_by_point" in kept and _OF_POINTS & given.keys():
-        del kept["grains_by_point"]
-        kept["grains"] = "auto"  # chosen again, for the points that are given
-    implied = _OF_ERROR if "error" in named else {}
-    return kept | implied | dict(given)
-
-
-def _parameters_of(file: Path) -> dict[str, Any]:
-    """The parameters of the map in a file; a warning names other differences that could change its
-    numbers.
-    """
-    from jaxgran.maps.attributes import from_attrs
-    from jaxgran.maps.results import differences, open_map
-
-    data = open_map(file)
-    settings, different = from_attrs(data), differences(data)
-    if different:
-        warnings.warn(f"differs from {file}: {'; '.join(different)}.", stacklevel=4)
-    # the tolerance holds for another solver too
-    return settings | {"tolerance": getattr(settings["solver"], "tolerance", None)}

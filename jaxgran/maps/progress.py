@@ -92,15 +92,15 @@ class Meter:
 
     def _line(self) -> str:
         seconds, done = time.perf_counter() - self.start, self._cost_of_run
-        points = sum(left == 0 for left in self.left.values())
+        points = sum(seeds == 0 for seeds in self.left.values())
         percent = 100 * (self.resumed_cost + done) / self.total
-        left = (
-            _duration(seconds * max(self.total - self.resumed_cost - done, 0.0) / done)
+        time_left = (
+            duration(seconds * max(self.total - self.resumed_cost - done, 0.0) / done)
             if done > 0
             else "unknown time"
         )
         speed = f"{self.done_steps / seconds:.3g} replica-steps/s"
-        return f"{points}/{len(self.left)} points, {percent:.0f} % done, {speed}, {left} left"
+        return f"{points}/{len(self.left)} points, {percent:.0f} % done, {speed}, {time_left} left"
 
 
 @contextmanager
@@ -116,7 +116,7 @@ def progress(settings: MapSettings, quiet: bool) -> Iterator[Meter]:
         meter.console.print(meter._line(), highlight=False)
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """A time as hours:minutes:seconds."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)

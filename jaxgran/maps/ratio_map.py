@@ -23,12 +23,13 @@ from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import Provenance
 from jaxgran.maps.dataset import map_dataset, run_attributes
 from jaxgran.maps.interruption import Interrupted, is_interruption
-from jaxgran.maps.presets import with_start
+from jaxgran.maps.own_observables import sums_by_name
 from jaxgran.maps.progress import progress
 from jaxgran.maps.replica import Advance, Key, Replica
 from jaxgran.maps.run_replicas import run_replicas
 from jaxgran.maps.settings import OPTIONS, MapSettings, RunOptions, table
 from jaxgran.maps.settings_checks import require_engine
+from jaxgran.maps.start import with_start
 from jaxgran.maps.status_report import (
     BadPoints,
     bad_points,
@@ -36,8 +37,10 @@ from jaxgran.maps.status_report import (
     short_samples_message,
 )
 from jaxgran.maps.store import Store, open_store, replica_count
-from jaxgran.model.checks import refused
+from jaxgran.maps.variables import COORDINATES, VARIABLES
+from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.choices import Activation
+from jaxgran.sampling.observables import OBSERVABLES
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -160,6 +163,7 @@ def settle(parameters: Mapping[str, Any]) -> tuple[MapSettings, RunOptions]:
     run = RunOptions(**{row.name: parameters[row.name] for row in fields(RunOptions)})
     settings, automatic_choice = chosen_settings(parameters)
     require_engine(settings)
+    _require_own_observables(settings)
     _require_own_attributes(run, settings)
     attributes = {"automatic_choice": automatic_choice, **(run.attributes or {})}
     run = replace(run, workers=_workers(run), attributes=attributes)
@@ -207,14 +211,24 @@ def run_missing(settings: MapSettings, run: RunOptions, store: Store) -> Measure
     return Measured(results, attributes | (run.attributes or {}), interruption)
 
 
+def _require_own_observables(settings: MapSettings) -> None:
+    """Raise an InputError if one of the user's observables has a name of the map's."""
+    names = {*OBSERVABLES, *COORDINATES, *(row.path.partition("/")[0] for row in VARIABLES)}
+    for name in sums_by_name(settings) or ():
+        if name in names or name.endswith(("_stderr", "_ci95")):
+            raise InputError(
+                f"observe must return names that a map does not have, not {short_repr(name)}."
+            )
+
+
 def _require_own_attributes(run: RunOptions, settings: MapSettings) -> None:
     """Raise an InputError if the user's attributes have a name of the map's; only the command may
     be given.
     """
-    own = set(run.attributes or {}) - {"command"}
-    if not own:
+    names = set(run.attributes or {}) - {"command"}
+    if not names:
         return
-    for name in own & {*OPTIONS, *run_attributes(settings), *_OF_RUN}:
+    for name in names & {*OPTIONS, *run_attributes(settings), *_OF_RUN}:
         raise refused("attributes", name, "must have names that a map does not have")
 
 
@@ -242,8 +256,8 @@ def _warn_of_bad_points(data: xr.DataTree) -> None:
     """Warn of points with a bad status and of short samples."""
     bad = bad_points(data)
     bad.pop("failed", None)  # batches that were given up have had a warning of their own
-    short = bad.pop("short_sample", [])
-    if short:
-        warnings.warn(short_samples_message(data, short), BadPoints, stacklevel=4)
+    short_samples = bad.pop("short_sample", [])
+    if short_samples:
+        warnings.warn(short_samples_message(data, short_samples), BadPoints, stacklevel=4)
     if bad:
         warnings.warn(bad_points_message(data, bad), BadPoints, stacklevel=4)

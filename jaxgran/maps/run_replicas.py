@@ -5,7 +5,6 @@ results do not depend on the other points of the map, on the batches, their orde
 workers.
 """
 
-import math
 import warnings
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
@@ -19,14 +18,14 @@ from jaxtyping import Array, UInt32
 
 from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.dynamics.batch import in_threads, replicas_of, stack
-from jaxgran.io.atomic import CorruptFile
+from jaxgran.io.arrays import CorruptFile
+from jaxgran.maps.automatic import sampling_targets
 from jaxgran.maps.batches import batches
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import Provenance, run_on_cluster
 from jaxgran.maps.journal import Journal
 from jaxgran.maps.replica import Advance, Key, Replica, ReplicaId, replica_ids
 from jaxgran.maps.settings import MapSettings
-from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.observe import AdvanceWrapper, ObserveBatch, advance_batch, reporting
 from jaxgran.sampling.sample_batch import sample_batch
 from jaxgran.sampling.steady_state import prepare_batch
@@ -84,7 +83,8 @@ def run_replicas(
                 checkpoint.add(dict(outcome))
             if scheduler is not None:
                 keys, steps = zip(
-                    *((key, one.sample.tally.steps.sum()) for key, one in outcome), strict=True
+                    *((key, replica.sample.tally.steps.sum()) for key, replica in outcome),
+                    strict=True,
                 )
                 report(Advance(keys, [float(flows[point].timestep) for point, _ in keys], steps))
             yield from outcome
@@ -122,11 +122,11 @@ def _run_task(
     """Prepare and sample the replicas of one batch; a batch that does not fit into memory is
     halved.
     """
-    advance = _reporting(task, report)
+    advance, replicas = _reporting(task, report), replica_ids(settings, task)
     try:
         if journal is not None:
-            advance = Journal(journal, replica_ids(settings, task), advance)
-        return _measured(settings, task, advance, record)
+            advance = Journal(journal, replicas, advance)
+        return _measured(settings, task, replicas, advance, record)
     except CorruptFile:
         assert journal is not None
         journal.unlink(missing_ok=True)
@@ -164,26 +164,23 @@ def _folded_key(seed: Array, number: Array) -> UInt32[Array, "2"]:
 def _measured(
     settings: MapSettings,
     task: Sequence[Key],
+    replicas: Sequence[ReplicaId],
     advance: ObserveBatch,
     record: AdvanceWrapper | None = None,
 ) -> list[tuple[Key, Replica]]:
     """Prepare and sample the replicas of a batch."""
     flows = settings.flows()
     flow = stack([flows[point] for point, _ in task])
-    keys = np.stack([random_key(replica) for replica in replica_ids(settings, task)])
+    keys = np.stack(list(map(random_key, replicas)))
     grains = settings.grains_of(flow.grains, len(task))
     batch = prepare_batch(
         flow, keys, settings.equilibrate, advance, grains=grains, numerics=settings.numerics
     )
     strain_before = batch.strain
-    error = (
-        None
-        if settings.error is None
-        else sampling_error(settings.error) * math.sqrt(settings.seeds)
-    )
+    targets = sampling_targets(settings, flow)
     sampling = advance if settings.observe is None else partial(advance, observe=settings.observe)
     batch, sample = sample_batch(
-        batch, settings.strain, sampling if record is None else record(sampling), error
+        batch, settings.strain, sampling if record is None else record(sampling), targets
     )
     states = replicas_of(batch.state) if settings.snapshots else [None] * len(task)
     columns = replicas_of(sample), batch.status.tolist(), strain_before.tolist(), states

@@ -16,7 +16,7 @@ import xarray as xr
 from jaxgran.model.checks import InputError
 from jaxgran.sampling.observables import OBSERVABLES, TENSOR_AXES
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 """Version of the groups and names in the data of a map; a file of another one is refused."""
 
 MapData: TypeAlias = xr.DataTree | xr.Dataset
@@ -24,7 +24,7 @@ MapData: TypeAlias = xr.DataTree | xr.Dataset
 RATIO = ("force_ratio", "force_ratio_stderr")
 
 ERROR_SOURCES = ("total", "sampling", "timestep", "size", "tolerance")
-"""Coordinate of ``NAME_ci95``."""
+"""Coordinate of ``NAME_large_system_ci95``."""
 
 FINEST: dict[str, Callable[[list], float]] = {"grains": max, "timestep": min}
 """Optional dimensions of a map, with the functions that pick the value of the smallest errors."""
@@ -139,12 +139,12 @@ def parts(data: MapData) -> list[xr.Dataset]:
 
 
 def relative_ci95(data: MapData, name: str) -> dict[str, np.ndarray]:
-    """Half-width of the 95 % interval of an average over the average, at every point, by the source
-    of the error.
+    """Half-width of the 95 % interval of an average of a large system over the average, at every
+    point, by the source of the error.
     """
-    data = flattened(data)
+    large = flattened(data)[[f"{name}_large_system", f"{name}_large_system_ci95"]]
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = data[f"{name}_ci95"] / np.abs(data[name])
+        share = large[f"{name}_large_system_ci95"] / np.abs(large[f"{name}_large_system"])
     return {source: share.sel(error_source=source).values for source in ERROR_SOURCES}
 
 

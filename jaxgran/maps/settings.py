@@ -209,6 +209,20 @@ class MapSettings:
         """One flow for each point, in the order of ``axes``: the last one changes fastest."""
         return list(_kept_flows(self))
 
+    def new_flows(self) -> "list[ShearFlow]":
+        """The same flows, made anew; InputError if a number of a flow is out of its range."""
+        from jaxgran.model.flow import ShearFlow
+
+        points = product(self.timesteps, self.packing_fraction, self.restitution)
+        if self.grains_by_point is None:
+            sized_points = product(self.sizes, points)
+        else:
+            sized_points = zip(self.grains_by_point, points, strict=True)
+        same = {"activation": self.activation, "polydispersity": self.polydispersity}
+        return [
+            ShearFlow(grains, alpha, nu, dt, **same) for grains, (dt, nu, alpha) in sized_points
+        ]
+
     def grains_of(self, size: int, replicas: int) -> "Grains | None":
         """The discs (replicas, size) that a flow is given; None where their diameters are
         uniform.
@@ -230,20 +244,8 @@ class MapSettings:
         return None if self.diameters is None else self.grains_of(8 * len(self.diameters), replicas)
 
 
-def new_flows(settings: MapSettings) -> "list[ShearFlow]":
-    """``settings.flows()``; InputError if a number of a flow is out of its range."""
-    from jaxgran.model.flow import ShearFlow
-
-    points = product(settings.timesteps, settings.packing_fraction, settings.restitution)
-    if settings.grains_by_point is None:
-        sized_points = product(settings.sizes, points)
-    else:
-        sized_points = zip(settings.grains_by_point, points, strict=True)
-    same = {"activation": settings.activation, "polydispersity": settings.polydispersity}
-    return [ShearFlow(grains, alpha, nu, dt, **same) for grains, (dt, nu, alpha) in sized_points]
-
-
-_kept_flows = lru_cache(maxsize=4)(new_flows)  # a map of many points has hundreds of batches
+# a map of many points has hundreds of batches
+_kept_flows = lru_cache(maxsize=4)(MapSettings.new_flows)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -328,7 +330,7 @@ OPTIONS: dict[str, Option] = {
 
 def options(command: Command) -> dict[str, Option]:
     """The parameters that a command offers, by name."""
-    return {name: one for name, one in OPTIONS.items() if command in one.commands}
+    return {name: row for name, row in OPTIONS.items() if command in row.commands}
 
 
 def is_new_dimension(name: str) -> bool:

@@ -1,4 +1,10 @@
-"""What is accepted as the settings of a map, and as the options of its run."""
+"""What is accepted as the settings of a map, and as the options of its run.
+
+``settings`` calls these checks, and nothing of it is needed here: the rows of a value are its
+``fields``.
+"""
+
+from __future__ import annotations
 
 import math
 import os
@@ -6,31 +12,35 @@ import re
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, require_solver
 from jaxgran.dynamics.batch import stack
 from jaxgran.dynamics.engine import checked_numerics, select_engine
-from jaxgran.io.atomic import require_place
-from jaxgran.maps.own_observables import require_observe
-from jaxgran.maps.settings import DEFAULTS, OPTIONS, MapSettings, RunOptions, new_flows
+from jaxgran.io.paths import require_place
 from jaxgran.model.checks import (
     InputError,
     refused,
     require_flag,
     require_number,
     require_whole,
+    short_repr,
     two_digits,
 )
 from jaxgran.model.choices import MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import own_grains
+from jaxgran.sampling.observe import observed_shapes
 from jaxgran.sampling.packing import require_room
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.thresholds import LEAST_SAMPLE
 from jaxgran.sampling.timestep import expected_temperature, longest_timestep
+
+if TYPE_CHECKING:
+    from jaxgran.maps.settings import MapSettings, RunOptions
 
 FEWEST_STEPS = 160  # of a sample: five time steps in each of its 32 blocks
 _LARGEST_SEED = 2**30
@@ -81,15 +91,15 @@ def check_settings(settings: MapSettings) -> None:
             f"not {points * settings.seeds}.",
             field="seeds",
         )
-    for row in fields(MapSettings):
-        value, accepted = getattr(settings, row.name), OPTIONS[row.name].range
+    for row in fields(settings):
+        value, accepted = getattr(settings, row.name), row.metadata["option"].range
         if accepted is not None and value is not None and row.name not in settings.axes:
             require_number(row.name, value, *accepted)
-    flows = new_flows(settings)
+    flows = settings.new_flows()
     _check_diameters(settings, flows)
     _check_part(settings, points)
     if settings.observe is not None:
-        require_observe(settings.observe, flows[0])
+        _check_observe(settings.observe, flows[0])
     _check_timesteps(settings, stack_of_any_size(flows))
 
 
@@ -97,7 +107,8 @@ def _check_diameters(settings: MapSettings, flows: Sequence[ShearFlow]) -> None:
     if settings.diameters is None:
         return
     own_grains(settings.diameters)  # type: ignore[arg-type]
-    if settings.polydispersity != DEFAULTS["polydispersity"]:
+    defaults = {row.name: row.default for row in fields(settings)}
+    if settings.polydispersity != defaults["polydispersity"]:
         reason = "must be left out where `diameters` are given"
         raise refused("polydispersity", settings.polydispersity, reason)
     if any(size % len(settings.diameters) for size in settings.sizes):
@@ -118,6 +129,29 @@ def _check_part(settings: MapSettings, points: int) -> None:
     if share is None or not int(share[1]) <= int(share[2]) <= points:
         reason = f"must be K/N with K at most N, and N at most {points}, the number of points"
         raise refused("part", settings.part, reason)
+
+
+def _check_observe(observe: Any, flow: ShearFlow) -> None:
+    """Raise an InputError unless a function returns numbers or arrays, summed over contacts, by
+    name.
+    """
+    if not callable(observe):
+        reason = "must be a function that is passed to `ratio_map`, or None"
+        raise refused("observe", observe, reason)
+    try:
+        hash(observe)
+    except TypeError:
+        raise refused("observe", observe, "must be hashable") from None
+    shapes = observed_shapes(observe, flow)
+    names = list(shapes) if isinstance(shapes, dict) else []
+    if not names or not all(isinstance(x, jax.ShapeDtypeStruct) for x in shapes.values()):
+        raise InputError(
+            "observe must return a dictionary of numbers or arrays by name.", field="observe"
+        )
+    if not all(isinstance(name, str) and name.isidentifier() for name in names):
+        raise InputError(
+            f"observe must return names without spaces and signs, not {short_repr(names)}."
+        )
 
 
 def _check_timesteps(settings: MapSettings, flows: ShearFlow) -> None:

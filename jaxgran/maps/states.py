@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import xarray as xr
 
-from jaxgran.analysis.instant import Instant, instant_of
+from jaxgran.analysis.contacts import ForceNetwork, force_network
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.model.choices import Activation
@@ -90,7 +90,7 @@ def instant_at(
     packing_fraction: float,
     timestep: float,
     activation: Activation,
-) -> Instant | None:
+) -> ForceNetwork | None:
     """The grains of a state, and the forces of the time step that begins with it, by the default
     solver.
 
@@ -100,4 +100,4 @@ def instant_at(
         len(state.grains.radii), restitution, packing_fraction, timestep, activation=activation
     )
     last = _snapshot(flow, state)
-    return None if last.status >= Status.infeasible else instant_of(last)
+    return None if last.status >= Status.infeasible else force_network(last)

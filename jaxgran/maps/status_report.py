@@ -59,8 +59,8 @@ def bad_points_message(data: MapData, bad: dict[str, list[str]]) -> str:
 def short_samples_message(data: MapData, points: list[str]) -> str:
     """Which samples are shorter than a few correlation strains, and the strain that they need."""
     code = data.status.attrs["flag_meanings"].split().index("short_sample")
-    short = data.status == data.status.attrs["flag_values"][code]
-    enough = FEWEST_CORRELATION_STRAINS * float(data.correlation_strain.where(short).max())
+    is_short = data.status == data.status.attrs["flag_values"][code]
+    enough = FEWEST_CORRELATION_STRAINS * float(data.correlation_strain.where(is_short).max())
     which = "" if data.status.size == 1 else f" at {_some(points)}"
     return (
         f"short sample{which}: less than {FEWEST_CORRELATION_STRAINS:g} correlation strains, so "

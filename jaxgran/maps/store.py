@@ -57,9 +57,16 @@ def open_store(settings: MapSettings, run: RunOptions) -> Iterator[Store]:
     if run.output is None:
         yield Store()
         return
-    earlier, difference = earlier_map(run.output, settings)
+    earlier, difference = _earlier_map(run.output, settings)
     finished = earlier if earlier is not None and results.is_finished(earlier) else None
-    continued = run.resume and _is_unfinished(run.output, earlier, settings)
+    # an unfinished map whose replicas settings of other axes, seeds or part have too
+    continued = (
+        run.resume
+        and earlier is not None
+        and finished is None
+        and checkpoint_folder(run.output).exists()
+        and identity_of_replicas(from_attrs(earlier)) == identity_of_replicas(settings)
+    )
     if difference and not (run.overwrite or continued):
         raise InputError(
             f"output {short_repr(str(run.output))} already exists and has {difference}; "
@@ -80,7 +87,7 @@ def open_store(settings: MapSettings, run: RunOptions) -> Iterator[Store]:
     checkpoint.close(finished=len(checkpoint.done) == replica_count(settings))
 
 
-def earlier_map(path: Path, settings: MapSettings) -> tuple[xr.DataTree | None, str]:
+def _earlier_map(path: Path, settings: MapSettings) -> tuple[xr.DataTree | None, str]:
     """The map that is in a file already, or None, and a description of what a map of these settings
     would replace.
 
@@ -97,15 +104,6 @@ def earlier_map(path: Path, settings: MapSettings) -> tuple[xr.DataTree | None, 
         name, before, now = difference
         return data, f"a map with {name} {short_repr(before)} and not {short_repr(now)}"
     return data, ""
-
-
-def _is_unfinished(path: Path, earlier: xr.DataTree | None, settings: MapSettings) -> bool:
-    """Whether the earlier map of a file is an unfinished one that settings with other axes, seeds
-    or part continue, so that its replicas are in the checkpoint.
-    """
-    if earlier is None or results.is_finished(earlier) or not checkpoint_folder(path).exists():
-        return False
-    return identity_of_replicas(from_attrs(earlier)) == identity_of_replicas(settings)
 
 
 def replica_count(settings: MapSettings) -> int:

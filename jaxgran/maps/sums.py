@@ -58,21 +58,21 @@ def replicas_of(data: xr.DataTree, settings: MapSettings) -> dict[Key, Replica |
         "sums/status"
     ].attrs  # those of the file, which an earlier version may have written
     for value, name in zip(flags["flag_values"], flags["flag_meanings"].split(), strict=True):
-        own = Status[name] if name in Status.__members__ else NOT_RUN
-        status = np.where(numbers["sums/status"].values.reshape(shape) == value, own, status)
+        code = Status[name] if name in Status.__members__ else NOT_RUN
+        status = np.where(numbers["sums/status"].values.reshape(shape) == value, code, status)
     sums = numbers["sums/tally"].values
     sums = sums.reshape(*shape, *sums.shape[-2:])
     dtype, own_sums = np.dtype(str(data.attrs["precision"])), sums_by_name(settings)
     states = states_of(data["states"].to_dataset(), len(flows), dtype) if settings.snapshots else {}
-    found: dict[Key, Replica | None] = {}
+    replicas: dict[Key, Replica | None] = {}
     for point, seed in np.argwhere(status >= Status.ok).tolist():
         key = point, seed
         if np.isnan(area[key]):
-            found[key] = None
+            replicas[key] = None
             continue
         tally = tally_from_flat(sums[key], dtype, own_sums)
         shear_rate = dtype.type(flows[point].shear_rate)
         sample = Sample(tally, dtype.type(area[key]), shear_rate, flows[point].grains)
         state = states.pop(point, None) if status[key] < GIVEN_UP else None
-        found[key] = Replica(sample, int(status[key]), float(strain[key]), state)
-    return found
+        replicas[key] = Replica(sample, int(status[key]), float(strain[key]), state)
+    return replicas

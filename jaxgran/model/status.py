@@ -13,7 +13,7 @@ class Status(IntEnum):
 
     ok = 0
     iteration_limit = 1  # a contact solve ended above the tolerance
-    strain_limit = 2  # the sample reached its longest strain before the requested error
+    imprecise = 2  # the error is larger than the requested one
     short_sample = (
         3  # the sample lasts only a few correlation strains, so its errors may be too small
     )
@@ -33,8 +33,8 @@ DEEP_SHARE = 0.1  # of the contacts; up to twice this share, stresses change by 
 
 MEANINGS = {
     "iteration_limit": "some contact solve ended above the tolerance",
-    "strain_limit": "the longest strain was sampled before the error was reached, take more seeds "
-    "or a larger error",
+    "imprecise": "the error of a large system is larger than the requested one, take more seeds, "
+    "more grains or a larger error",
     "short_sample": "the sample lasts only a few correlation strains, so its errors may be too "
     "small",
     "not_steady": "temperature or pressure still drifted, sample longer, or prepare longer by "

@@ -53,7 +53,7 @@ def grain_data(
     tilt: float,
     scale: Scale,
 ) -> dict[str, Any]:
-    """One instant for a page; the arguments are those of an ``Instant``, and a scale.
+    """One instant for a page; the arguments are those of a ``ForceNetwork``, and a scale.
 
     ``data`` has, one after the other and in base64: x and y of the grains in parts of 65536 of the
     cell, with the tilt taken off x; both grains of each pair (16 bits each); radii, speeds and

@@ -31,7 +31,7 @@ _AXES = {
     "restitution": "restitution α",
 }
 _PLANE = ("packing_fraction", "restitution")
-_COMPANIONS = ("_stderr", "_ci95")
+_COMPANIONS = ("_stderr", "_large_system", "_large_system_ci95")
 _FIRST = ("force_ratio", "excess")  # the page opens with the second
 _GROUPS = ("stresses/", "theory/", "diagnostics/")
 _LEFT_OUT = ("status", "point_grains")
@@ -49,8 +49,9 @@ def map_data(data: MapData) -> dict[str, Any]:
     =============  =================================================================================
     axes           the dimensions, outermost first: name, label and values; numbers of grains and
                    time steps have one value if the map has one, and none if it is not known
-    observables    name, meaning and unit; values; and where the map has them standard errors, whole
-                   errors, predictions of kinetic theory and numbers of effective samples
+    observables    name, meaning and unit; values; and where the map has them standard errors,
+                   predictions of kinetic theory, numbers of effective samples, and values and
+                   half-widths of 95 % intervals of a large system
     status         the status of each point; meanings of the statuses
     grains         the number of grains of each point, if it was chosen by point
     instants       grains and forces of each point, see ``grain_data``
@@ -134,7 +135,7 @@ def _with_excess(data: xr.Dataset) -> xr.Dataset:
         return data
     excess = (data.force_ratio - 1).assign_attrs(long_name="force ratio − 1", units="1")
     errors = {
-        f"excess{end}": data[f"force_ratio{end}"]
+        f"excess{end}": data[f"force_ratio{end}"] - (end == "_large_system")
         for end in _COMPANIONS
         if f"force_ratio{end}" in data
     }
@@ -160,7 +161,8 @@ def _observables(
 ) -> Iterator[dict[str, Any]]:
     """The entry of a variable, or those of its components."""
     about = data[name].attrs
-    parts = {"value": name, "error": f"{name}_stderr", "whole": f"{name}_ci95"}
+    parts = {"value": name, "error": f"{name}_stderr"}
+    parts |= {"large": f"{name}_large_system", "whole": f"{name}_large_system_ci95"}
     parts |= {"theory": f"theory/{label}"} if path_of(label) == name else {}
     samples = _effective_samples(data, label)
     for component, chosen in _components(data[name]).items():

@@ -40,7 +40,9 @@ def reference_dataset() -> xr.Dataset:
         put(path, table.columns[name], long_name=meaning, units=unit)
         put(f"{path}_stderr", stderr)
         if f"{name}_bound" in table.columns:
-            put(f"{path}_ci95", np.hypot(HALF_INTERVAL * stderr, table.columns[f"{name}_bound"]))
+            half = np.hypot(HALF_INTERVAL * stderr, table.columns[f"{name}_bound"])
+            put(f"{path}_large_system", table.columns[name])
+            put(f"{path}_large_system_ci95", half)
     for name, values in table.series(table.points).items():
         put(f"theory/{name}", np.exp(values))
     found = validity(*reversed(flows))

@@ -18,7 +18,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from jaxgran.analysis.instant import Instant, instant_of
+from jaxgran.analysis.contacts import ForceNetwork, force_network
 from jaxgran.analysis.series import series
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import minimum_image
@@ -92,7 +92,7 @@ def flow_figure(seen: Snapshot, colour: Colour = "speed", strain: float | None =
     return figure
 
 
-def network_of(seen: Snapshot) -> Instant:
+def network_of(seen: Snapshot) -> ForceNetwork:
     """The grains and forces of a snapshot, or of a series of snapshots; checks that they can be
     drawn.
     """
@@ -108,23 +108,23 @@ def network_of(seen: Snapshot) -> Instant:
         raise InputError(
             "seen must be of a sheared flow: its shear rate is the unit of the picture."
         )
-    return instant_of(seen)
+    return force_network(seen)
 
 
-def pressures(network: Instant) -> Float[np.ndarray, " grains"]:
+def pressures(network: ForceNetwork) -> Float[np.ndarray, " grains"]:
     """Σ F r/2πr² over the contacts of each grain, in mγ̇²."""
     forces, radii = np.repeat(network.force, 2), network.radii
     return np.bincount(network.pairs.ravel(), forces, len(radii)) / (2 * np.pi * radii)
 
 
-def common_scale(networks: Iterable[Instant], colour: Colour) -> Scale:
+def common_scale(networks: Iterable[ForceNetwork], colour: Colour) -> Scale:
     """One scale for several pictures, so that they can be compared."""
     networks = list(networks)
     values = np.concatenate([_values(network, colour) for network in networks])
     return Scale(deepest(values), widest(np.concatenate([one.force for one in networks])))
 
 
-def _values(network: Instant, colour: Colour) -> Float[np.ndarray, " grains"]:
+def _values(network: ForceNetwork, colour: Colour) -> Float[np.ndarray, " grains"]:
     return network.speed if colour == "speed" else pressures(network)
 
 
@@ -132,7 +132,7 @@ def _values(network: Instant, colour: Colour) -> Float[np.ndarray, " grains"]:
 # drawing
 
 
-def draw_flow(axes: Axes, network: Instant, colour: Colour, scale: Scale) -> Artists:
+def draw_flow(axes: Axes, network: ForceNetwork, colour: Colour, scale: Scale) -> Artists:
     """Draw grains and forces in a square window."""
     half = network.side / 2
     axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", xticks=(), yticks=())
@@ -156,7 +156,7 @@ def draw_flow(axes: Axes, network: Instant, colour: Colour, scale: Scale) -> Art
     return artists
 
 
-def show_flow(artists: Artists, network: Instant, colour: Colour, scale: Scale) -> None:
+def show_flow(artists: Artists, network: ForceNetwork, colour: Colour, scale: Scale) -> None:
     """Show another instant of a flow by artists that are there."""
     which, places = _images(network, network.positions, network.radii)
     sizes = 2 * network.radii[which]
@@ -178,7 +178,7 @@ def show_flow(artists: Artists, network: Instant, colour: Colour, scale: Scale) 
 
 
 def _images(
-    network: Instant, points: np.ndarray, reach: np.ndarray
+    network: ForceNetwork, points: np.ndarray, reach: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and their images that reach into the window: indices (images,) and positions
     (images, 2) in σ.

@@ -15,10 +15,10 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from PIL import Image
 
-from jaxgran.analysis.instant import Instant
+from jaxgran.analysis.contacts import ForceNetwork
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.files import atomic_write
-from jaxgran.io.atomic import require_place
+from jaxgran.io.paths import require_place
 from jaxgran.model.checks import InputError, short_repr
 from jaxgran.plotting.encoding import BINARY_COLOUR
 from jaxgran.plotting.flow import (
@@ -45,7 +45,7 @@ _Follow = Callable[[Sequence], Iterable]  # passes items on, and may report how 
 class Frame(NamedTuple):
     """A flow at one time."""
 
-    network: Instant
+    network: ForceNetwork
     title: str
     strain: float  # since the first frame
 

@@ -161,18 +161,18 @@ def corrected_shear(
     length, pairs = correlation_length(laws, alpha, nu), pair_factor(laws, alpha, nu)
     mixture = uniform_mixture(nu, width, size_classes)
     mixture = mixture._replace(encounters=pairs * mixture.encounters)
-    found = steady_moments(
+    moments = steady_moments(
         alpha, rate, mixture, jnp.log(garzo_dufty(alpha, nu).granular_temperature), length
     )
     of_temperature, of_pressure, of_shear = laws.scatter
     return CorrectedShear(
-        granular_temperature=found.granular_temperature,
-        pressure=found.pressure,
-        shear_stress=found.shear_stress,
-        dissipation_rate=found.dissipation_rate,
-        granular_temperature_stderr=found.granular_temperature * of_temperature,
-        pressure_stderr=found.pressure * of_pressure,
-        shear_stress_stderr=found.shear_stress * of_shear,
+        granular_temperature=moments.granular_temperature,
+        pressure=moments.pressure,
+        shear_stress=moments.shear_stress,
+        dissipation_rate=moments.dissipation_rate,
+        granular_temperature_stderr=moments.granular_temperature * of_temperature,
+        pressure_stderr=moments.pressure * of_pressure,
+        shear_stress_stderr=moments.shear_stress * of_shear,
         correlation_length=length,
         pair_factor=pairs,
         extrapolated=outside(alpha, laws.restitution_range)

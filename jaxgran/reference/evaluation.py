@@ -16,18 +16,18 @@ PLANE = ("restitution", "packing_fraction")
 
 
 class Estimate(NamedTuple):
-    """Logarithms of an average: over the theory's prediction, of the prediction, and half of its 95
-    % interval.
+    """Logarithms: of an average over the theory's prediction, of the prediction, and the half-width
+    of the 95 % interval.
     """
 
-    over: Any
-    theory: Any
-    half: Any
+    log_ratio: Any
+    log_theory: Any
+    log_half: Any
 
     def value_and_ci95(self, xp: Any) -> tuple[Any, Any]:
         """The average, and the half-width of its 95 % interval."""
-        value = xp.exp(self.over + self.theory)
-        return value, value * xp.sinh(self.half)
+        value = xp.exp(self.log_ratio + self.log_theory)
+        return value, value * xp.sinh(self.log_half)
 
 
 def estimates(
@@ -35,14 +35,15 @@ def estimates(
 ) -> dict[str, Estimate]:
     """Averages by name at coordinates in the measured range; that of ``LENGTH`` is over one."""
     logs = table.series(where, xp)
-    found = {}
+    by_name = {}
     for name in names:
-        over, stderr = table.surfaces[name](where, xp)
+        log_ratio, stderr = table.surfaces[name](where, xp)
         half = HALF_INTERVAL * stderr
         if name in table.bounds:
             half = xp.hypot(half, xp.exp(table.bounds[name].mean(where, xp)))
-        found[name] = Estimate(over, 0.0 if name == LENGTH else logs[theory_of(name)], half)
-    return found
+        log_theory = 0.0 if name == LENGTH else logs[theory_of(name)]
+        by_name[name] = Estimate(log_ratio, log_theory, half)
+    return by_name
 
 
 def over_range(
@@ -85,14 +86,10 @@ def over_range(
         return alpha, nu, evaluate(where, np)
     import jax
 
-    found = jax.vmap(lambda one: evaluate(one, xp))(
-        where.reshape(-1, 2)
-    )  # one by one: ranks are promoted nowhere
-    return (
-        alpha,
-        nu,
-        jax.tree.map(lambda x: xp.where(inside, x.reshape(alpha.shape), np.nan), found),
-    )
+    # one by one: ranks are promoted nowhere
+    averages = jax.vmap(lambda point: evaluate(point, xp))(where.reshape(-1, 2))
+    shaped = jax.tree.map(lambda x: xp.where(inside, x.reshape(alpha.shape), np.nan), averages)
+    return alpha, nu, shaped
 
 
 def module_of(*values: Any) -> Any:

@@ -139,10 +139,10 @@ class ConstitutiveLaw:
         """
         shear_rate = as_array(shear_rate)
         require("shear_rate", shear_rate, lambda x: x > 0, "a positive number")
-        *_, found = over_range(self.table, self._evaluated, restitution, packing_fraction)
+        *_, averages = over_range(self.table, self._evaluated, restitution, packing_fraction)
         xp = module_of(restitution, packing_fraction, shear_rate)
         scaled = {}
-        for name, (value, ci95) in found.items():
+        for name, (value, ci95) in averages.items():
             value, ci95, rate = xp.broadcast_arrays(value, ci95, xp.asarray(shear_rate, float))
             scale = rate ** _POWERS[name]
             scaled |= {name: value * scale, f"{name}_ci95": ci95 * scale}
@@ -153,8 +153,8 @@ class ConstitutiveLaw:
         the range.
         """
         return {
-            name: one.value_and_ci95(xp)
-            for name, one in estimates(self.table, where, xp, _UNITS).items()
+            name: estimate.value_and_ci95(xp)
+            for name, estimate in estimates(self.table, where, xp, _UNITS).items()
         }
 
     def to_csv(

@@ -43,15 +43,16 @@ class Shape:
     noise: float = 1.0  # of the points
     leave_one_out: float = 1.0  # of the surface
 
-    def covariance(self, one: Any, other: Any, xp: Any = np) -> Any:
+    def covariance(self, where: Any, points: Any, xp: Any = np) -> Any:
         """Prior covariance of (..., 2) and (points, 2) coordinates, (..., points)."""
-        first, second = ((one[..., None, k] - other[:, k]) / self.lengths[k] for k in (0, 1))
+        first, second = ((where[..., None, k] - points[:, k]) / self.lengths[k] for k in (0, 1))
         r = xp.sqrt(5 * (first**2 + second**2) + _TINY)
-        return self.amplitude**2 * (1 + r + r**2 / 3) * xp.exp(-r) + _SLOPE**2 * (1 + one @ other.T)
+        plane = _SLOPE**2 * (1 + where @ points.T)
+        return self.amplitude**2 * (1 + r + r**2 / 3) * xp.exp(-r) + plane
 
-    def variance(self, one: Any, xp: Any = np) -> Any:
+    def variance(self, where: Any, xp: Any = np) -> Any:
         """Prior variance at (..., 2) coordinates."""
-        return self.amplitude**2 + _SLOPE**2 * (1 + xp.sum(one**2, axis=-1))
+        return self.amplitude**2 + _SLOPE**2 * (1 + xp.sum(where**2, axis=-1))
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,8 @@ class Surface:
         """Errors at the points where each is left out in turn, and their expected standard
         deviations.
         """
-        own = np.sum(self._whitening**2, axis=0)
-        return self._weights / own, self.shape.leave_one_out / np.sqrt(own)
+        precision = np.sum(self._whitening**2, axis=0)
+        return self._weights / precision, self.shape.leave_one_out / np.sqrt(precision)
 
     def log_likelihood(self) -> float:
         """Logarithm of the probability density of the values, up to a constant."""

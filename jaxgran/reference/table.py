@@ -149,25 +149,24 @@ class Table:
         """The surfaces of the logarithm of every bound, over its average; that of the force ratio
         is not.
         """
-        found = {}
-        for name in [name for name in self.shapes if f"{name}_bound" in self.columns]:
-            over = 1.0 if name == RATIO else self.columns[name]
-            values = np.log(self.columns[f"{name}_bound"] / over)
-            found[name] = Surface(
-                self.points, values, np.full(values.shape, _BOUND_STDERR), _BOUND_SHAPE
-            )
-        return found
+        bounds = {}
+        for name in self.shapes:
+            if f"{name}_bound" in self.columns:
+                scale = 1.0 if name == RATIO else self.columns[name]
+                values = np.log(self.columns[f"{name}_bound"] / scale)
+                stderrs = np.full(values.shape, _BOUND_STDERR)
+                bounds[name] = Surface(self.points, values, stderrs, _BOUND_SHAPE)
+        return bounds
 
     @cached_property
     def shapes(self) -> dict[str, Shape]:
-        found = {}
+        shapes = {}
         for key, text in self.head.items():
             if key.startswith("surface "):
                 amplitude, first, second, noise, left_out = map(float, text.split())
-                found[key.removeprefix("surface ")] = Shape(
-                    amplitude, (first, second), noise, left_out
-                )
-        return found
+                shape = Shape(amplitude, (first, second), noise, left_out)
+                shapes[key.removeprefix("surface ")] = shape
+        return shapes
 
     def surface(self, name: str, shape: Shape) -> Surface:
         """The surface of an average, of a given shape."""

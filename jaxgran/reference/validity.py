@@ -93,8 +93,8 @@ class Validity(NamedTuple):
         """
         logs = np.abs(np.log([self.factors[name] for name in FACTORS]))
         names = np.array(FACTORS, object)[np.argmax(logs, axis=0)]
-        found = np.where(np.max(logs, axis=0) > _NEGLIGIBLE, names, "none")
-        return found if found.ndim else str(found)
+        failing = np.where(np.max(logs, axis=0) > _NEGLIGIBLE, names, "none")
+        return failing if failing.ndim else str(failing)
 
     def at(self, place: Any) -> "Validity":
         """One flow of an array of flows, or a part of them; for values that are known, not
@@ -103,7 +103,7 @@ class Validity(NamedTuple):
 
         def part(x: Any) -> Any:
             return (
-                {name: part(one) for name, one in x.items()}
+                {name: part(value) for name, value in x.items()}
                 if isinstance(x, dict)
                 else np.asarray(x)[place]
             )
@@ -123,7 +123,7 @@ class Validity(NamedTuple):
         """The ``COLUMNS`` of every average of one flow, as texts; an average and an error with a 95
         % interval.
         """
-        found = []
+        rows = []
         for name, measured in self.measured.items():
             predicted = self.theory.get(name.removeprefix("local_"))
             theory = "" if predicted is None else f"{predicted:.4g}"
@@ -137,8 +137,8 @@ class Validity(NamedTuple):
                     f"{with_error(100 * float(x), 100 * float(ci95))} %" for x, ci95 in of_theories
                 ]
             interval = with_error(float(measured), float(self.measured_ci95[name]))
-            found.append([name.replace("_", " "), interval, theory, *errors])
-        return found
+            rows.append([name.replace("_", " "), interval, theory, *errors])
+        return rows
 
     def _sentence(self) -> str:
         """The verdict on one flow."""
@@ -190,13 +190,15 @@ def validity(restitution: Any, packing_fraction: Any) -> Validity:
         JAX traces it without ``jax_enable_x64``.
 
     Examples:
-      >>> found = validity(0.98, 0.5)
-      >>> bool(abs(found.error["pressure"]) < 0.05)
+      >>> at_point = validity(0.98, 0.5)
+      >>> bool(abs(at_point.error["pressure"]) < 0.05)
       True
     """
     table = shipped_table()
-    alpha, nu, found = over_range(table, partial(_evaluated, table), restitution, packing_fraction)
-    return Validity(alpha, nu, *found)
+    alpha, nu, averages = over_range(
+        table, partial(_evaluated, table), restitution, packing_fraction
+    )
+    return Validity(alpha, nu, *averages)
 
 
 def _evaluated(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
@@ -205,18 +207,18 @@ def _evaluated(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
         {} for _ in range(8)
     )
     logs = table.series(where, xp)
-    for name, one in estimates(table, where, xp).items():
+    for name, estimate in estimates(table, where, xp).items():
         log = logs[CORRECTED + theory_of(name)]
-        measured[name], ci95[name] = one.value_and_ci95(xp)
+        measured[name], ci95[name] = estimate.value_and_ci95(xp)
         if not name.startswith("local_"):
-            theory[name], corrected[name] = xp.exp(one.theory), xp.exp(log)
+            theory[name], corrected[name] = xp.exp(estimate.log_theory), xp.exp(log)
         if name != "granular_temperature":
-            error[name] = xp.expm1(-one.over)
-            error_ci95[name] = xp.exp(-one.over) * xp.sinh(one.half)
-            over = one.over + one.theory - log
+            error[name] = xp.expm1(-estimate.log_ratio)
+            error_ci95[name] = xp.exp(-estimate.log_ratio) * xp.sinh(estimate.log_half)
+            log_ratio = estimate.log_ratio + estimate.log_theory - log
             corrected_error[name], corrected_ci95[name] = (
-                xp.expm1(-over),
-                xp.exp(-over) * xp.sinh(one.half),
+                xp.expm1(-log_ratio),
+                xp.exp(-log_ratio) * xp.sinh(estimate.log_half),
             )
     value, stderr = table.surfaces["force_ratio"](where, xp)
     measured["force_ratio"] = 1 + excess_from_surface(value, xp)

@@ -1,19 +1,20 @@
-"""The error budget of an average: sampling, time step, tolerance and number of grains, each by a
-measured law.
+"""From an average at N grains to that of a large system, and its error.
 
 A standard error says how an average scatters over samples of the same length. It does not say how
-far the average is from that of a large system, of short time steps and of exact contact solves. The
-laws here bound these differences.
+far the average is from that of a large system, of short time steps and of exact contact solves. An
+average is corrected for its number of grains, and a share of the correction is an error; the other
+two laws are bounds.
 
 =========  =========================================================================================
 part       law, and what it was measured with
 =========  =========================================================================================
+size       ``SizeLaw``: long waves of velocity are missing in small systems; ``jamming_error``: the
+           packing fraction at which they jam scatters (``benchmarks size_limits``, also with flows
+           that the laws were not fitted to)
 time step  ``stress_error``: the share of its free path that a grain moves in one step (``benchmarks
            stability``)
 tolerance  34 times the relative residual of a contact solve, for the part of the stress that
            contacts carry (``benchmarks solvers``)
-size       ``size_error``: long waves of velocity are missing in small systems, and the packing
-           fraction at which they jam scatters (``benchmarks size_limits``)
 =========  =========================================================================================
 
 A force ratio belongs to its time step, so the time step adds no error to it.
@@ -30,10 +31,12 @@ from jaxgran.sampling.timestep import distance_to_jamming, stress_error
 
 # relative error of the stress of one solve over its residual, that 98 % of solves do not exceed
 RESIDUAL_FACTOR = 34
-
-# Largest share of a requested error that each source may take; their squares add up to one.
-_SQUARES = {"sampling": 0.44, "size": 0.36, "timestep": 0.16, "tolerance": 0.04}
-SHARES = {source: square**0.5 for source, square in _SQUARES.items()}
+MEASURED_POLYDISPERSITY = 0.26  # of the flows that all laws here are measured with
+_MOST_MISSING = 0.6  # with a few grains the laws do not hold
+# The excess of a force ratio has 1.2 times the error of the pressure, and so has another tenth:
+# clusters of grains are also missing where the mean force hardly exceeds that of binary collisions.
+_OF_EXCESS, _UNSEEN_EXCESS = 1.2, 0.1
+_FRICTION_SHARE = 0.7  # of the error of the pressure that the shear stress does not share
 
 
 class SizeLaw(NamedTuple):
@@ -41,7 +44,9 @@ class SizeLaw(NamedTuple):
     waves are missing:
 
     (elastic + dissipative (1 − α)) exp(density (ν − 0.5)) min(1, (end − ν)/0.1)
-    (N/1600)^(−exponent).
+    (N/1600)^(−exponent), at most 0.6.
+
+    ``spread`` is the half-width of the 95 % interval of the missing part of a flow, over the law.
     """
 
     exponent: float
@@ -49,46 +54,49 @@ class SizeLaw(NamedTuple):
     dissipative: float
     density: float
     end: float
+    spread: float
 
     def missing(
         self, restitution: ArrayLike, packing_fraction: ArrayLike, grains: ArrayLike
     ) -> np.ndarray:
         alpha, nu, count = (np.asarray(x, float) for x in (restitution, packing_fraction, grains))
         waves = (self.elastic + self.dissipative * (1 - alpha)) * np.exp(self.density * (nu - 0.5))
-        return waves * np.clip((self.end - nu) / 0.1, 0, 1) * (count / 1600) ** -self.exponent
+        part = waves * np.clip((self.end - nu) / 0.1, 0, 1) * (count / 1600) ** -self.exponent
+        return np.minimum(part, _MOST_MISSING)
 
 
-SIZE_LAWS: dict[str, SizeLaw] = {  # fits of ``benchmarks size_limits``
-    "pressure": SizeLaw(0.4175, 0.00494, 0.1151, 0.3665, 0.8193),
-    "shear_stress": SizeLaw(0.5639, 0.00744, 0.03257, 3.591, 0.8012),
-    "granular_temperature": SizeLaw(0.2314, 0.01633, 0.3066, 0.8507, 0.8096),
-    "local_granular_temperature": SizeLaw(0.7592, 0.0, 0.02069, 2.435, 0.8015),
+SIZE_LAWS: dict[str, SizeLaw] = {  # fits of ``benchmarks size_limits``, and their spreads
+    "pressure": SizeLaw(0.4175, 0.00494, 0.1151, 0.3665, 0.8193, 0.5),
+    "shear_stress": SizeLaw(0.5639, 0.00744, 0.03257, 3.591, 0.8012, 0.5),
+    "granular_temperature": SizeLaw(0.2314, 0.01633, 0.3066, 0.8507, 0.8096, 0.75),
+    "local_granular_temperature": SizeLaw(0.7592, 0.0, 0.02069, 2.435, 0.8015, 1.5),
 }
-MEASURED_POLYDISPERSITY = 0.26  # of the flows that all laws here are measured with
-SIZE_SPREAD = 0.5  # half-width of the 95 % interval of the missing part of one flow, over the law
+
+LARGE_SYSTEM = ("force_ratio", "macroscopic_friction", *SIZE_LAWS)
+"""The averages of which ``large_system`` has estimates."""
 
 
-class Law(NamedTuple):
-    """How the errors of one average follow from those of the stresses, as factors; 0 where there is
-    none.
+class Estimate(NamedTuple):
+    """An average of a large system, and the half-widths of its 95 % interval by source, in its
+    unit.
+
+    ===========  ===================================================================================
+    source       half-width
+    ===========  ===================================================================================
+    total        of all sources together, √(sampling² + timestep² + size² + tolerance²)
+    sampling     1.96 standard errors
+    timestep     bound on the error from the time step
+    size         error of the correction for the number of grains
+    tolerance    bound on the error from the tolerance of the contact solves
+    ===========  ===================================================================================
     """
 
-    timestep: float
-    tolerance: float
-    size: float
-    sized_as: str  # the average with the same law of the size
-
-
-BUDGET: dict[str, Law] = {
-    "force_ratio": Law(
-        0.0, 1.0, 1.0, "pressure"
-    ),  # that of the size is the share of the excess, see ``error_budget``
-    "pressure": Law(1.0, 1.0, 1.0, "pressure"),
-    "shear_stress": Law(1.0, 1.0, 1.0, "shear_stress"),
-    "granular_temperature": Law(1.0, 1.0, 1.0, "granular_temperature"),
-    "local_granular_temperature": Law(1.0, 1.0, 1.0, "local_granular_temperature"),
-    "macroscopic_friction": Law(1.0, 1.0, 0.7, "pressure"),
-}
+    value: np.ndarray
+    total: np.ndarray
+    sampling: np.ndarray
+    timestep: np.ndarray
+    size: np.ndarray
+    tolerance: np.ndarray
 
 
 def size_error(
@@ -97,8 +105,7 @@ def size_error(
     grains: ArrayLike,
     average: str = "pressure",
 ) -> np.ndarray:
-    """Bound on the difference of an average at N grains from that of a large system, over the
-    latter.
+    """Half-width of the 95 % interval of an average that is corrected for its N, over the average.
 
     The first term is that of long waves of velocity. It grows with dissipation and vanishes in
     dense flows. The second is that of jamming: the packing fraction at which a small system jams
@@ -108,10 +115,11 @@ def size_error(
       The default number of grains, in a loose and in a dense flow:
 
       >>> [round(float(size_error(0.5, nu, 256)), 3) for nu in (0.6, 0.8)]
-      [0.218, 0.099]
+      [0.081, 0.058]
     """
-    waves = (1 + SIZE_SPREAD) * SIZE_LAWS[average].missing(restitution, packing_fraction, grains)
-    return waves + jamming_error(packing_fraction, grains)
+    missing = SIZE_LAWS[average].missing(restitution, packing_fraction, grains)
+    waves = SIZE_LAWS[average].spread * missing / (1 - missing)
+    return np.hypot(waves, jamming_error(packing_fraction, grains))
 
 
 def jamming_error(packing_fraction: ArrayLike, grains: ArrayLike) -> np.ndarray:
@@ -119,28 +127,31 @@ def jamming_error(packing_fraction: ArrayLike, grains: ArrayLike) -> np.ndarray:
     return 0.007 / distance_to_jamming(packing_fraction) * (100 / np.asarray(grains, float)) ** 1.25
 
 
-def sampling_error(error: float) -> float:
-    """The standard error that takes the share of sampling in a requested error."""
-    return SHARES["sampling"] * error / HALF_INTERVAL
+def sampling_target(
+    error: float,
+    restitution: ArrayLike,
+    packing_fraction: ArrayLike,
+    grains: ArrayLike,
+    crossing: ArrayLike,
+    tolerance: float,
+) -> np.ndarray:
+    """The relative standard error of the stresses that the other parts of a requested error leave
+    for sampling; negative where they exceed it.
 
-
-def fewest_grains(restitution: float, packing_fraction: float, size: float) -> int:
-    """The smallest of 256, 362, 512, 724, ... grains, in steps of √2, whose ``size_error`` is
-    within a given one.
-
-    So programs are compiled for few numbers of grains, and no system is much larger than necessary.
+    Args:
+      error: half-width of the 95 % interval of pressure and shear stress, over these.
+      restitution, packing_fraction, grains: of the flow.
+      crossing: dt √T/σ.
+      tolerance: relative residual of a contact solve.
     """
-    step = 0
-    while size_error(restitution, packing_fraction, _grains_at(step)) > size:
-        step += 1
-    return _grains_at(step)
+    flow = restitution, packing_fraction, grains
+    size = np.maximum(size_error(*flow), size_error(*flow, "shear_stress"))
+    others = size**2 + stress_error(crossing, packing_fraction) ** 2
+    left = error**2 - others - (RESIDUAL_FACTOR * tolerance) ** 2
+    return np.sign(left) * np.sqrt(np.abs(left)) / HALF_INTERVAL
 
 
-def _grains_at(step: int) -> int:
-    return round(256 * 2 ** (step / 2))
-
-
-def error_budget(
+def large_system(
     values: Mapping[str, ArrayLike],
     errors: Mapping[str, ArrayLike],
     restitution: ArrayLike,
@@ -148,19 +159,11 @@ def error_budget(
     grains: ArrayLike,
     timestep: ArrayLike,
     tolerance: ArrayLike,
-) -> dict[str, dict[str, np.ndarray]]:
-    """Half-widths of the 95 % interval of every average in ``BUDGET``, by source and in its unit,
-    for arrays of points.
+) -> dict[str, Estimate]:
+    """The averages in ``LARGE_SYSTEM`` of a large system, for arrays of points.
 
-    ===========  ===================================================================================
-    source       half-width
-    ===========  ===================================================================================
-    total        of all sources together, √(sampling² + timestep² + size² + tolerance²)
-    sampling     1.96 standard errors
-    timestep     bound on the error from the time step
-    size         bound on the difference from a large system
-    tolerance    bound on the error from the tolerance of the contact solves
-    ===========  ===================================================================================
+    The friction follows from the laws of both stresses. What is missing of the part of a force
+    ratio that exceeds one is taken as that of the pressure.
 
     Args:
       values, errors: averages and their standard errors, by name; also contact_stress, (..., 2, 2).
@@ -168,27 +171,36 @@ def error_budget(
       timestep: dt of the sample, in t.
       tolerance: relative residual of a contact solve.
     """
+    flow = restitution, packing_fraction, grains
     temperature = np.asarray(values["granular_temperature"], float)
     with np.errstate(invalid="ignore", divide="ignore"):
         step = stress_error(np.asarray(timestep) * np.sqrt(temperature), packing_fraction)
         contact = np.asarray(values["contact_stress"])
         in_contacts = (contact[..., 0, 0] + contact[..., 1, 1]) / 2 / np.asarray(values["pressure"])
     solve = RESIDUAL_FACTOR * np.asarray(tolerance) * in_contacts
-    budget = {}
-    for name, law in BUDGET.items():
-        size = size_error(restitution, packing_fraction, grains, law.sized_as)
-        size = size / np.maximum(
-            1 - size, 0.1
-        )  # over the average at N grains, which may be the smaller one
+    present = {name: 1 - law.missing(*flow) for name, law in SIZE_LAWS.items()}
+    estimates = {}
+    for name in LARGE_SYSTEM:
         value, stderr = np.asarray(values[name], float), np.asarray(errors[name], float)
-        scale = np.abs(value)
-        sized = np.abs(value - 1) + 0.03 if name == "force_ratio" else scale
-        sampling = HALF_INTERVAL * stderr
-        bounds = {
-            "timestep": law.timestep * step * scale,
-            "size": law.size * size * sized,
-            "tolerance": law.tolerance * solve * scale,
+        if name == "force_ratio":
+            factor = 1 / present["pressure"]
+            large = 1 + factor * (value - 1)
+            size = _OF_EXCESS * size_error(*flow) * (np.abs(large - 1) + _UNSEEN_EXCESS)
+        elif name == "macroscopic_friction":
+            factor = present["pressure"] / present["shear_stress"]
+            large = factor * value
+            size = _FRICTION_SHARE * size_error(*flow) * np.abs(large)
+        else:
+            factor = 1 / present[name]
+            large = factor * value
+            size = size_error(*flow, name) * np.abs(large)
+        scale = np.abs(large)
+        parts = {
+            "sampling": HALF_INTERVAL * factor * stderr,
+            "timestep": (0.0 if name == "force_ratio" else 1.0) * step * scale,
+            "size": size,
+            "tolerance": solve * scale,
         }
-        total = np.sqrt(sampling**2 + sum(bound**2 for bound in bounds.values()))
-        budget[name] = {"total": total, "sampling": sampling, **bounds}
-    return budget
+        total = np.sqrt(sum(part**2 for part in parts.values()))
+        estimates[name] = Estimate(large, total, **parts)
+    return estimates

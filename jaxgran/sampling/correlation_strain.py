@@ -28,7 +28,7 @@ _WAVE = 0.35  # correlation strain of the longest waves over γ̇ L √(ρ/p)
 
 def flow_correlation_strain(
     averages: Mapping[str, ArrayLike],
-    grains: int,
+    grains: ArrayLike,
     mass: ArrayLike,
     area: ArrayLike,
     shear_rate: ArrayLike,
@@ -54,7 +54,7 @@ def flow_correlation_strain(
         for name in ("granular_temperature", "pressure", "shear_stress")
     )
     with np.errstate(divide="ignore", invalid="ignore"):
-        heating = grains / xp.asarray(area) * temperature / shear_stress
+        heating = xp.asarray(grains) / xp.asarray(area) * temperature / shear_stress
         waves = _WAVE * xp.asarray(shear_rate) * xp.sqrt(xp.asarray(mass) / pressure)
     return xp.maximum(
         RELAXATION_STRAIN, xp.fmax(*(xp.where(xp.isfinite(x), x, 0.0) for x in (heating, waves)))
@@ -81,5 +81,5 @@ def length_status(strain: Any, correlation_strain: Any) -> Any:
     ``ok``.
     """
     xp = jnp if isinstance(strain, jax.Array) else np
-    short = strain < FEWEST_CORRELATION_STRAINS * correlation_strain
-    return xp.where(short, Status.short_sample.value, Status.ok.value)
+    is_short = strain < FEWEST_CORRELATION_STRAINS * correlation_strain
+    return xp.where(is_short, Status.short_sample.value, Status.ok.value)

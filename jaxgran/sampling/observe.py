@@ -33,7 +33,7 @@ from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
 _NEEDS_VALUES = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
-Observable = Callable[[Snapshot], Any]  # returns a pytree of arrays to average
+Observe = Callable[[Snapshot], Any]  # returns a pytree of arrays to average
 
 # Advances each replica of a batch by its number of steps, (replicas,), and a wrapper that adds
 # reports or records and leaves the states alone.
@@ -52,7 +52,7 @@ class ObserveBatch(Protocol):
         numerics: Numerics,
         state: State,
         steps: Array | np.ndarray,
-        observe: Observable | None = None,
+        observe: Observe | None = None,
     ) -> tuple[State, Tally]: ...
 
 
@@ -61,7 +61,7 @@ def advance_batch(
     numerics: Numerics,
     state: State,
     steps: Array | np.ndarray,
-    observe: Observable | None = None,
+    observe: Observe | None = None,
     threads: int = 1,
 ) -> tuple[State, Tally]:
     """Advance each replica of a batch by its number of time steps.
@@ -91,7 +91,7 @@ def reporting(advance: ObserveBatch, report: Report) -> ObserveBatch:
         numerics: Numerics,
         state: State,
         steps: Array | np.ndarray,
-        observe: Observable | None = None,
+        observe: Observe | None = None,
     ) -> tuple[State, Tally]:
         state, tally = advance(flow, numerics, state, steps, observe)
         report(flow.timestep, tally.steps)
@@ -105,7 +105,7 @@ def advance_and_observe(
     state: State,
     steps: Array,
     numerics: Numerics,
-    observe: Observable | None = None,
+    observe: Observe | None = None,
 ) -> tuple[State, Tally]:
     """``advance``, with the sums of what a function observes in ``Tally.observed``."""
     if observe is None:
@@ -120,7 +120,7 @@ _advance_replica = persistent_jit(advance_and_observe, register_numba)
 _observe_replica = jax.jit(advance_and_observe, static_argnames="observe")
 
 
-def observed_shapes(observe: Observable, flow: ShearFlow) -> Any:
+def observed_shapes(observe: Observe, flow: ShearFlow) -> Any:
     """Shape and dtype of the sums of what a function observes in a flow, a pytree of
     ``jax.ShapeDtypeStruct``.
 
@@ -140,7 +140,7 @@ def dimensions_of(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
     return tuple(f"{name}_dim_{k}" for k in range(len(shape)))
 
 
-def digest_of(observe: Observable, flow: ShearFlow) -> str:
+def digest_of(observe: Observe, flow: ShearFlow) -> str:
     """A hash of what a function computes in a flow: jaxpr, constants of it and of what it calls,
     and results.
     """
@@ -168,14 +168,14 @@ def _constants(part: Any) -> Iterator[np.ndarray]:
                 yield from _constants(parameter)
         yield from (np.asarray(x.val) for x in part.outvars if isinstance(x, Literal))
     elif isinstance(part, (tuple, list)):
-        for one in part:
-            yield from _constants(one)
+        for element in part:
+            yield from _constants(element)
     elif isinstance(part, (np.ndarray, jax.Array)):
         yield np.asarray(part)
 
 
 def _observe_step(
-    observe: Observable, flow: ShearFlow, state: State, contacts: Contacts, impulses: Array
+    observe: Observe, flow: ShearFlow, state: State, contacts: Contacts, impulses: Array
 ) -> Any:
     """The result of ``observe`` for the contacts and impulses of one step."""
     snapshot = snapshot_of(flow, state, contacts, impulses, jnp.int32(Status.ok))
@@ -189,7 +189,7 @@ def _observe_step(
         ) from None
 
 
-def _line_of(observe: Observable, error: Exception) -> str:
+def _line_of(observe: Observe, error: Exception) -> str:
     """The line of a user's function that raised an error; "it" where that is not known."""
     file = getattr(getattr(observe, "__code__", None), "co_filename", "")
     lines = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]

@@ -119,8 +119,8 @@ def pack(
     )
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), iterate, before)
     positions, tilt = present(end.neighbours, side)
-    found = end.overlap < allowed
-    fit = found if generated else found & (widest_skin(grains, side) > 0)
+    packed = end.overlap < allowed
+    fit = packed if generated else packed & (widest_skin(grains, side) > 0)
     return State(grains, positions, at_rest, side, tilt), fit
 
 

@@ -70,7 +70,7 @@ def size_classes(grains: Grains) -> tuple[np.ndarray, np.ndarray]:
     edges = np.arange(_SIZE_CLASSES + 1) * order.shape[-1] // _SIZE_CLASSES
     members = [order[..., first:last] for first, last in pairwise(edges)]
     mean_radii, mean_masses = (
-        np.stack([np.mean(np.take_along_axis(x, one, -1), -1) for one in members], axis=-1)
+        np.stack([np.mean(np.take_along_axis(x, numbers, -1), -1) for numbers in members], axis=-1)
         for x in (radii, masses)
     )
     return mean_radii / np.mean(mean_radii, -1, keepdims=True), mean_masses

@@ -18,7 +18,7 @@ from jaxgran.model.checks import InputError, is_traced, require_untraced
 from jaxgran.model.display import are_numbers, rounded, text_of
 from jaxgran.model.status import Status
 from jaxgran.sampling.averages import averages
-from jaxgran.sampling.observables import OBSERVABLES, Averages
+from jaxgran.sampling.observables import OBSERVABLES, Observables
 from jaxgran.statistics import (
     Estimates,
     correlation_length,
@@ -65,7 +65,7 @@ def _computed_once(compute: Callable[["Sample"], T]) -> T:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Sample(Averages, Indexable):
+class Sample(Observables, Indexable):
     """A measured strain of one replica; a batch has a leading (replicas,) axis everywhere.
 
     ==========  =========  ====  =================================================
@@ -227,7 +227,7 @@ def observed_estimates(
         return {str(k): leaf for k, leaf in enumerate(leaves)}
 
     parts = ((seed.observed_sums, seed.tally.steps) for seed in seeds)
-    sums = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *parts)
+    sums = jax.tree.map(lambda *x: np.stack(list(map(np.asarray, x))), *parts)
     total = jax.tree.map(lambda x: x.sum(axis=(0, 1)), sums)
     structure = jax.tree.structure(jax.eval_shape(estimate_of_sums, *total))
     values, errors = standard_errors(leaves_by_number, sums, durations(seeds))
@@ -243,7 +243,7 @@ def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
     average, sums = _stacked(seeds)
     values, errors = standard_errors(average, sums, durations(seeds))
     by_block = average(sums)
-    extremes = {name: by_block[name] for name, one in OBSERVABLES.items() if one.extreme}
+    extremes = {name: by_block[name] for name, row in OBSERVABLES.items() if row.extreme}
     largest = {name: np.asarray(x.max()) for name, x in extremes.items()}
     spread = {name: np.asarray(x.std() if x.size > 1 else np.nan) for name, x in extremes.items()}
     return values | largest, errors | spread
@@ -289,7 +289,7 @@ def _stacked(seeds: Sequence[Sample]) -> tuple[Callable[[Tally], dict[str, Array
     """
     first = seeds[0]
     sums = jax.tree.map(
-        lambda *x: np.stack([np.asarray(one) for one in x]), *(seed.tally for seed in seeds)
+        lambda *x: np.stack(list(map(np.asarray, x))), *(seed.tally for seed in seeds)
     )
     return partial(
         averages, area=first.area, grains=first.grains, shear_rate=first.shear_rate

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from jaxgran.model.status import GIVEN_UP, Status
@@ -28,7 +29,7 @@ def sample_batch(
     batch: Batch,
     strain: float | None,
     advance: AdvanceBatch = advance_batch,
-    error: float | None = None,
+    error: ArrayLike | None = None,
 ) -> tuple[Batch, Sample]:
     """Sample every replica of a batch in blocks whose numbers of time steps differ by one at most.
 
@@ -36,10 +37,10 @@ def sample_batch(
       batch: prepared replicas.
       strain: strain to sample, or None for six correlation strains of each flow, at least 8.
       advance: advances the batch.
-      error: target for the relative standard error of each of ``ERROR_OBSERVABLES``. The strain of
-        a replica begins with twice the one without a target, and is doubled until the target is
-        reached, up to ``LONGEST_STRAIN`` or 32 correlation strains, where its status is
-        ``strain_limit``. None samples ``strain`` only.
+      error: targets (replicas,) for the relative standard error of each of ``ERROR_OBSERVABLES``.
+        The strain of a replica begins with twice the one without a target, and is doubled until the
+        target is reached, up to ``LONGEST_STRAIN`` or 32 correlation strains, where its status is
+        ``imprecise``. None samples ``strain`` only.
     """
     strains = (
         np.maximum(LEAST_SAMPLE, SAMPLE_CORRELATION_STRAINS * batch.correlation_strain)
@@ -64,7 +65,7 @@ def sample_batch(
         correlation_strain=sampled_correlation_strain(sample, batch.state.grains)
     )
     of_length = length_status(strains, batch.correlation_strain)
-    of_error = np.where(imprecise, Status.strain_limit, Status.ok)
+    of_error = np.where(imprecise, Status.imprecise, Status.ok)
     return batch._replace(
         status=np.maximum.reduce([batch.status, of_length, of_error, sample.status])
     ), sample

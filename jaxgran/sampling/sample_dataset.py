@@ -34,12 +34,12 @@ def dataset_of(sample: "Sample") -> xr.Dataset:
         np.asarray(sample.status, np.int8),
         {"long_name": "status", **flags},
     )
-    own = _own_variables(sample, replicas)
-    if taken := [name for name in own if name in variables]:
+    observed = _own_variables(sample, replicas)
+    if taken := [name for name in observed if name in variables]:
         raise InputError(
             f"observe must return names that a sample does not have, not {short_repr(taken[0])}."
         )
-    variables |= own
+    variables |= observed
     coordinates = {axis: ["x", "y"] for axis in TENSOR_AXES}
     return xr.Dataset(variables, coordinates, {"grains": sample.grains})
 

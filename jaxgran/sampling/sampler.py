@@ -31,7 +31,7 @@ from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps
 from jaxgran.model.state import State, require_match, require_state
 from jaxgran.sampling.blocks import advance_by_block, sample_of_blocks
 from jaxgran.sampling.correlation_strain import length_status, sampled_correlation_strain
-from jaxgran.sampling.observe import Observable, advance_and_observe, advance_batch
+from jaxgran.sampling.observe import Observe, advance_and_observe, advance_batch
 from jaxgran.sampling.sample import BLOCKS, Sample
 
 MOST_BLOCKS = 10**6
@@ -43,7 +43,7 @@ def sample(
     state: State,
     strain: float | Array,
     blocks: int = BLOCKS,
-    observe: Observable | None = None,
+    observe: Observe | None = None,
     callback: Callable[[State, Sample], Any] | None = None,
     *,
     solver: ProjectedMethod = DEFAULT_SOLVER,
@@ -151,7 +151,7 @@ def _sample(
     strain: Array,
     numerics: Numerics,
     blocks: int,
-    observe: Observable | None = None,
+    observe: Observe | None = None,
 ) -> tuple[State, Sample]:
     """The sample of one replica, in one compiled program."""
     steps = steps_of_blocks(steps_of_strain(flow, strain), blocks)
@@ -172,7 +172,7 @@ def _sample_with_callback(
     single: bool,
     numerics: Numerics,
     blocks: int,
-    observe: Observable | None,
+    observe: Observe | None,
     callback: Callable[[State, Sample], Any],
 ) -> tuple[State, Sample]:
     """The sample of a batch, or of a batch of a single replica, block by block."""

@@ -1,24 +1,27 @@
-"""The options of a command, from its table: their help texts, and their values from text.
+"""The options of a command, from its table: their help texts, their values from text, and what is
+wrong with them.
 
 Typer sees texts, flags and paths only. Numbers, lists and choices are read here, so every mistake
-is an ``InputError``.
+is an ``InputError``, on the command line as in Python.
 """
 
 import inspect
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Container, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from jaxgran.cli.mistakes import option_name, with_options
+from jaxgran.cli.terminal import run_command
 from jaxgran.maps.options import Command, Option
 from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.settings import DEFAULTS, is_new_dimension, options
-from jaxgran.model.checks import refused, require
+from jaxgran.model.checks import InputError, refused, require
 from jaxgran.model.choices import MAX_REPLICAS
 
+_PARAMETER = re.compile(r"`(\w+)(?:='?(\w+)'?)?`")  # in an InputError
 _MOST_DIGITS = 20  # of a whole number
 _LIST = f"or a list like 0.1,0.5,0.9 or start:stop:count with a count of 2 to {MAX_REPLICAS}"
 _WHOLE_LIST = "or a list like 256,1000,4000"
@@ -67,7 +70,11 @@ def command(
     def parsed(**texts: Any) -> None:
         file = () if argument is None else (texts.pop(place),)
         given = {name: text for name, text in texts.items() if text is not None}
-        run(*file, **{name: value(name, table[name], text) for name, text in given.items()})
+
+        def values_and_run() -> None:
+            run(*file, **{name: value(name, table[name], text) for name, text in given.items()})
+
+        run_command(values_and_run, lambda mistake: sentence_of(mistake, table))
 
     place, kind = ("files", list[Path]) if several else ("file", Path)
     parameters = []
@@ -162,3 +169,30 @@ def examples(commands: Mapping[str, str]) -> str:
         line for purpose, line in commands.items() for line in (f"  {purpose}:", f"    {line}")
     ]
     return "\b\n" + "\n".join(["Examples:", *lines])
+
+
+def option_name(field: str) -> str:
+    """The option of a parameter."""
+    return f"--{field.replace('_', '-')}"
+
+
+def with_options(text: str, names: Container[str]) -> str:
+    """The text with options in place of parameters in backticks: `overwrite=True` becomes
+    --overwrite.
+    """
+
+    def as_option(match: re.Match) -> str:
+        name, value = match.groups()
+        if name not in names:
+            return match[0]
+        return option_name(name) + ("" if value in (None, "True") else f" {value}")
+
+    return _PARAMETER.sub(as_option, text)
+
+
+def sentence_of(mistake: InputError | str, names: Container[str]) -> str:
+    """A message of the library in terms of the options of a command."""
+    text = with_options(str(mistake), names)
+    first, space, rest = text.partition(" ")  # the field, where it is named at all
+    named = isinstance(mistake, InputError) and mistake.field in ("", first)
+    return option_name(first) + space + rest if named and first in names else text

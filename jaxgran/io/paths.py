@@ -1,0 +1,36 @@
+"""A check of the path of a file before the work that is to be written there."""
+
+import os
+import tempfile
+from pathlib import Path
+
+from jaxgran.model.checks import InputError, refused, short_repr
+
+_LONGEST_NAME = 200  # bytes; file systems accept 255, and temporary files have longer names
+
+
+def require_place(path: Path, option: str, ending: str) -> None:
+    """Raise an InputError unless a file with this suffix can be written to ``path``."""
+    name, folder = short_repr(str(path)), short_repr(str(path.parent))
+    if path.suffix != ending:
+        raise refused(option, str(path), f"must be a file name that ends in {ending}")
+    if len(os.fsencode(path.name)) > _LONGEST_NAME:
+        raise refused(option, path.name, f"must be a file name of at most {_LONGEST_NAME} bytes")
+    if os.path.isdir(path):
+        raise InputError(f"{option} must be a file, and {name} is a folder.", field=option)
+    if not os.path.isdir(path.parent):
+        raise InputError(
+            f"{option} must be in a folder that exists, and {folder} does not.", field=option
+        )
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+        if path.exists():
+            with path.open("ab"):
+                pass
+    except OSError as error:
+        raise InputError(
+            f"{option} must be in a folder that can be written to, and {name} cannot: "
+            f"{error.strerror}.",
+            field=option,
+        ) from None
