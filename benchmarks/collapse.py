@@ -37,7 +37,7 @@ from matplotlib.figure import Figure
 
 import jaxgran as jg
 from benchmarks.output import Output
-from jaxgran.plotting.drawing import RATIO_LABEL, TWO_COLUMNS, styled
+from jaxgran.plotting.style import RATIO_LABEL, TWO_COLUMNS, styled
 
 THRESHOLDS = {3: 7 - 4 * np.sqrt(3), 4: 3 - 2 * np.sqrt(2)}
 RESTITUTIONS = {3: (0.02, 0.04, 0.055, 0.08, 0.1, 0.2), 4: (0.05, 0.1, 0.13, 0.18, 0.2, 0.3)}

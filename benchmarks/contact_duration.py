@@ -32,7 +32,7 @@ from benchmarks.output import Output
 from benchmarks.validation import EVENT_DRIVEN, OBSERVABLES
 from jaxgran.environment import usable_cores
 from jaxgran.maps.schema import path_of
-from jaxgran.plotting.drawing import TWO_COLUMNS, styled
+from jaxgran.plotting.style import TWO_COLUMNS, styled
 from jaxgran.statistics import standard_errors
 
 BLOCKS = 32  # of a sample, for its errors

@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
-from jaxgran.plotting.drawing import (
+from jaxgran.plotting.style import (
     NU_LABEL,
     SMALL_SIZE,
     TWO_COLUMNS,

@@ -27,7 +27,7 @@ from benchmarks.output import RESULTS, Output, rounded
 from jaxgran.environment import usable_cores
 from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.schema import flattened
-from jaxgran.plotting.drawing import SMALL_SIZE, TWO_COLUMNS, curve_styles, label_log_axis, styled
+from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, curve_styles, label_log_axis, styled
 from jaxgran.reference.corrected_shear import (
     MEASURED_LAWS,
     CorrelationLaws,

@@ -27,7 +27,7 @@ from matplotlib.lines import Line2D
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.environment import usable_cores
-from jaxgran.plotting.drawing import SMALL_SIZE, TWO_COLUMNS, curve_styles, styled
+from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, curve_styles, styled
 from jaxgran.sampling.enskog_factors import FACTORS, LENGTHS, RATES, measured_over_enskog
 from jaxgran.sampling.sample import estimates
 

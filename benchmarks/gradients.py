@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.model.cell import displacement
-from jaxgran.plotting.drawing import TWO_COLUMNS, styled
+from jaxgran.plotting.style import TWO_COLUMNS, styled
 
 FLOWS = ((0.9, 0.6), (0.5, 0.6), (0.7, 0.75), (0.3, 0.75))  # restitution, packing fraction
 DRAWN = (0.9, 0.6), (0.3, 0.75)

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.process import ROOT
 from jaxgran import environment
-from jaxgran.plotting.drawing import FILE_DPI, write
+from jaxgran.plotting.style import FILE_DPI, write
 
 RESULTS = ROOT / "benchmarks" / "results"
 PACKAGES = ("jaxgran", "jax", "jaxlib", "numpy", "numba")

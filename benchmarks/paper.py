@@ -13,9 +13,9 @@ from benchmarks.output import Output
 from jaxgran.environment import usable_cores
 from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.results import write_dataset
-from jaxgran.plotting.drawing import FILE_DPI, write
-from jaxgran.plotting.enskog_factors import enskog_factors
+from jaxgran.plotting.factors import enskog_factors
 from jaxgran.plotting.ratio import ratio_contours, ratio_curves
+from jaxgran.plotting.style import FILE_DPI, write
 from jaxgran.plotting.theory import theory_errors
 
 QUICK = {"restitution": (0.1, 0.5, 0.9), "packing_fraction": (0.5, 0.7, 0.8)}

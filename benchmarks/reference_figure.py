@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.plotting.drawing import ONE_COLUMN
+from jaxgran.plotting.style import ONE_COLUMN
 from jaxgran.reference.surface import coordinates
 from jaxgran.reference.table import FACTORS, Table, excess_from_surface
 

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 import jaxgran as jg
 from benchmarks.output import Output
 from benchmarks.process import printed_by
-from jaxgran.plotting.drawing import TWO_COLUMNS, styled
+from jaxgran.plotting.style import TWO_COLUMNS, styled
 
 GRAINS, QUICK_GRAINS = (128, 512, 2_000, 10_000, 30_000, 100_000, 1_000_000), (1_000, 10_000)
 TIMESTEPS, QUICK_TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5), (1e-2, 1e-3, 1e-4)

@@ -1,19 +1,20 @@
 """The figures of ``size_study``: values against N, and waves of velocity and density."""
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxgran.plotting.drawing import (
-    LABEL_SIZE,
+from jaxgran.plotting.style import (
     SMALL_SIZE,
     TWO_COLUMNS,
+    add_curve_legend,
     curve_styles,
+    draw_points,
+    draw_reference,
+    empty_figure,
     label_log_axis,
     styled,
 )
 
-LOOSE = 0.7  # packing fraction up to which a flow is drawn among the loose ones
 WAVE_FLOWS = (
     (0.1, 0.3),
     (0.2, 0.6),
@@ -22,25 +23,12 @@ WAVE_FLOWS = (
     (0.8, 0.6),
     (0.95, 0.6),
 )  # of the figure of waves
-STYLES = [
-    {"color": "black", "marker": "o", "linestyle": "-"},
-    {"color": "tab:blue", "marker": "s", "linestyle": "--"},
-    {"color": "tab:red", "marker": "^", "linestyle": "-."},
-    {"color": "tab:green", "marker": "D", "linestyle": ":"},
-    {"color": "tab:purple", "marker": "v", "linestyle": "-"},
-    {"color": "tab:brown", "marker": "P", "linestyle": "--"},
-]
-PANELS = (
-    ("pressure", "pressure over that\nof the largest N"),
-    ("granular_temperature", "granular temperature over\nthat of the largest N"),
-    ("local_granular_temperature", "local granular temperature\nover that of the largest N"),
-    ("force_ratio", "excess of the force ratio"),
-)
-GROUPS = (
-    ("loose, α ≤ 0.5", lambda row: row["packing_fraction"] <= LOOSE and row["restitution"] <= 0.5),
-    ("loose, α ≥ 0.8", lambda row: row["packing_fraction"] <= LOOSE and row["restitution"] > 0.5),
-    ("dense", lambda row: row["packing_fraction"] > LOOSE),
-)
+SIZE_FLOWS = ((0.1, 0.3), (0.2, 0.6), (0.5, 0.6), (0.8, 0.6), (0.2, 0.75), (0.8, 0.82))
+PANELS = {
+    "pressure": "(a) pressure",
+    "granular_temperature": "(b) granular temperature",
+    "local_granular_temperature": "(c) local temperature",
+}
 
 
 def flow_of(row: dict) -> tuple[float, float]:
@@ -50,66 +38,28 @@ def flow_of(row: dict) -> tuple[float, float]:
 
 def flow_name(alpha: float, nu: float) -> str:
     """A flow in the legend."""
-    return f"α {alpha:g}, ν {nu:g}"
+    return rf"$\alpha={alpha:g}$, $\nu={nu:g}$"
 
 
 @styled
 def draw_sizes(rows: list[dict]) -> Figure:
-    """Values against N, relative to the largest one; a column for each kind of flow, with standard
-    errors.
+    """Averages over those at the largest N of a flow, each with its own standard error; symbols of
+    different flows are moved apart a little.
     """
-    groups = [(name, [row for row in rows if inside(row)]) for name, inside in GROUPS]
-    groups = [(name, chosen) for name, chosen in groups if chosen]
-    figure = Figure(figsize=(TWO_COLUMNS, 8.0), layout="constrained")
-    panels = figure.subplots(len(PANELS), len(groups), sharex=True, squeeze=False)
-    for column, (title, chosen) in zip(panels.T, groups, strict=True):
-        flows = sorted({flow_of(row) for row in chosen})
-        for axes, (name, _) in zip(column, PANELS, strict=True):
-            for k, flow in enumerate(flows):
-                here = [row for row in chosen if flow_of(row) == flow]
-                draw_curve(axes, name, here, k, len(flows), flow_name(*flow))
-            axes.set_xscale("log")
-            axes.grid(color="0.9")
-            if name == "force_ratio":
-                axes.set_yscale("log")
-            else:
-                axes.axhline(1, color="0.6", linewidth=0.8)
-        column[0].set_title(f"{title}", fontsize=LABEL_SIZE)
-        column[0].legend(fontsize=SMALL_SIZE, frameon=False)
-        column[-1].set_xlabel("number of grains N")
-    for axes, (_, label) in zip(panels[:, 0], PANELS, strict=True):
-        axes.set_ylabel(label)
+    flows = [flow for flow in SIZE_FLOWS if flow in map(flow_of, rows)] or [flow_of(rows[0])]
+    figure = empty_figure(TWO_COLUMNS, 2.9)
+    grid = figure.subplots(1, len(PANELS), sharex=True, sharey=True)
+    for axes, (name, title) in zip(grid, PANELS.items(), strict=True):
+        draw_reference(axes)
+        for k, (flow, style) in enumerate(zip(flows, curve_styles(len(flows)), strict=True)):
+            chosen = [row for row in rows if flow_of(row) == flow]
+            grains = np.array([row["grains"] for row in chosen]) * 1.04 ** (k - len(flows) / 2)
+            value, error = np.array([row[name] for row in chosen]).T / chosen[-1][name][0]
+            draw_points(axes, grains, value, np.zeros(len(value), bool), style, yerr=error)
+        axes.set(xscale="log", xlabel="number of grains $N$", title=title)
+    grid[0].set_ylabel("average over that at the largest $N$")
+    add_curve_legend(figure, [flow_name(*flow) for flow in flows], "", bad=False)
     return figure
-
-
-def draw_curve(axes: Axes, name: str, rows: list[dict], k: int, count: int, label: str) -> None:
-    """One flow in one panel; markers of different flows are moved apart a little."""
-    grains = np.array([row["grains"] for row in rows]) * 1.04 ** (k - (count - 1) / 2)
-    value, error = np.array([row[name] for row in rows]).T
-    if name == "force_ratio":
-        shown = value - 1 > 2e-5
-        value, error = (value - 1)[shown], error[shown]
-        bars = np.stack([np.minimum(error, 0.9 * value), error])
-        axes.errorbar(
-            grains[shown],
-            value,
-            bars,
-            label=label,
-            capsize=2,
-            markersize=4,
-            **STYLES[k % len(STYLES)],
-        )
-    else:
-        largest = value[-1]
-        axes.errorbar(
-            grains,
-            value / largest,
-            error / largest,
-            label=label,
-            capsize=2,
-            markersize=4,
-            **STYLES[k % 6],
-        )
 
 
 @styled

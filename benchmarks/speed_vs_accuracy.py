@@ -33,7 +33,7 @@ from benchmarks.output import Output
 from benchmarks.peers.front import TARGET
 from jaxgran.dynamics.batch import stack
 from jaxgran.environment import usable_cores
-from jaxgran.plotting.drawing import TWO_COLUMNS, styled
+from jaxgran.plotting.style import TWO_COLUMNS, styled
 from jaxgran.sampling.sample import estimates
 from jaxgran.sampling.steady_state import prepare_batch
 

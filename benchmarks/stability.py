@@ -33,7 +33,7 @@ from jaxgran.dynamics.batch import stack
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import DEEP_OVERLAP
-from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TWO_COLUMNS, scientific, styled
+from jaxgran.plotting.style import LABEL_SIZE, SMALL_SIZE, TWO_COLUMNS, scientific, styled
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.prediction import predicted
 

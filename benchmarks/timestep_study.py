@@ -31,7 +31,7 @@ from scipy.optimize import minimize_scalar
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.environment import usable_cores
-from jaxgran.plotting.drawing import RATIO_LABEL, TWO_COLUMNS, styled
+from jaxgran.plotting.style import RATIO_LABEL, TWO_COLUMNS, styled
 from jaxgran.sampling.sample import estimates
 
 RULES = ("midpoint", "touching")

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.environment import usable_cores
-from jaxgran.plotting.drawing import TWO_COLUMNS, styled
+from jaxgran.plotting.style import TWO_COLUMNS, styled
 
 # (packing fraction, restitution): temperature, pressure, shear stress; m = σ = γ̇ = 1
 EVENT_DRIVEN = {

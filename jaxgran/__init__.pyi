@@ -27,11 +27,11 @@ from .model.grains import Grains, own_grains, polydisperse
 from .model.state import State
 from .model.status import Status
 from .page.explore import explore
-from .plotting.enskog_factors import enskog_factors
+from .plotting.against import averages_against_grains, ratio_against_timestep
+from .plotting.factors import enskog_factors
 from .plotting.flow import flow_figure
 from .plotting.map_figures import save_figures
-from .plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
-from .plotting.size import averages_against_grains
+from .plotting.ratio import ratio_contours, ratio_curves
 from .plotting.theory import cluster_shares, theory_errors
 from .reference.law import constitutive_law
 from .reference.validity import validity

@@ -3,7 +3,7 @@
 import numpy as np
 import xarray as xr
 
-from jaxgran.plotting.enskog_factors import PANELS
+from jaxgran.plotting.factors import FACTORS, PREFIX
 
 FLAGS = "ok iteration_limit not_steady deep_overlap infeasible capacity nonfinite"
 RATE = 8.0  # of the growth of the synthetic excess with 1 − α and with 2ν
@@ -127,10 +127,10 @@ def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
             for a, b in ((0, 0), (1, 1)) if name == "pressure" else ((0, 1), (1, 0)):
                 tensor[..., a, b] = part if a == b else -part
         added[f"theory/{name}"] = (DIMS, binary * np.exp(closure_of(x, nu)))
-    shown = {f"enskog_factor_pressure_{factor}": k for k, factor in enumerate(PANELS)}
-    for name, k in (shown | {"correlation_length_from_pressure": len(PANELS)}).items():
+    for k, factor in enumerate(FACTORS):
         value = np.exp(factor_of(k, x, nu)) * np.ones(data.force_ratio.shape)
-        added |= {f"theory/{name}": (DIMS, value), f"theory/{name}_stderr": (DIMS, STDERR * value)}
+        name = f"{PREFIX}{factor}"
+        added |= {name: (DIMS, value), f"{name}_stderr": (DIMS, STDERR * value)}
     added |= {name: ((*DIMS, "axis_a", "axis_b"), tensor) for name, tensor in tensors.items()}
     added |= {
         f"{name}_stderr": ((*DIMS, "axis_a", "axis_b"), STDERR * np.abs(x))

@@ -369,7 +369,9 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "is the last one of a series": lambda: jg.fields_at(SEVERAL, POINT, 1.0),
     "positive and at most 0.456 in this cell": lambda: jg.fields_at(SEEN, POINT, 1e308),
     "it has no packing_fraction, restitution, force_": lambda: jg.ratio_curves(xr.Dataset()),
-    "it has no pressure, theory/pressure": lambda: jg.theory_errors(ratio_dataset()),
+    "it has no pressure, shear_stress, stress_ratio, theory/pressure": lambda: jg.theory_errors(
+        ratio_dataset()
+    ),
     "has 5 and 1": lambda: jg.ratio_contours(ratio_dataset(5, 1)),
     "at least two time steps, and this map has 1": lambda: jg.ratio_against_timestep(
         ratio_dataset()
@@ -516,7 +518,7 @@ def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
     monkeypatch.setattr(
         ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok})
     )
-    write_few_variables(monkeypatch, *theory.SHARES)
+    write_few_variables(monkeypatch, *theory.CLUSTERS)
     monkeypatch.setattr(
         Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"a picture")
     )

@@ -8,20 +8,18 @@ import numpy as np
 import pytest
 import xarray as xr
 from drawn import contour_lines
-from made_up_maps import RATE, excess_of, ratio_dataset, with_timesteps
+from made_up_maps import RATE, excess_of, ratio_dataset
 from matplotlib import _pylab_helpers, rcParams
+from matplotlib.colors import same_color
 from matplotlib.container import ErrorbarContainer
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from jaxgran.plotting.encoding import EXCESS_LEVELS
 from jaxgran.plotting.map_figures import save_figures
-from jaxgran.plotting.ratio import (
-    EXCESS_LEVELS,
-    ratio_against_timestep,
-    ratio_contours,
-    ratio_curves,
-)
+from jaxgran.plotting.plane import STANDARD_ERROR
+from jaxgran.plotting.ratio import ratio_contours, ratio_curves
 
 
 def lines_of_contours(figure: Figure) -> dict[float, np.ndarray]:
@@ -30,9 +28,15 @@ def lines_of_contours(figure: Figure) -> dict[float, np.ndarray]:
 
 
 def bands_of_contours(figure: Figure) -> list[np.ndarray]:
-    """Return the vertices of every uncertainty band."""
-    sets = [artist for artist in figure.axes[0].collections if isinstance(artist, QuadContourSet)]
-    return [s.get_paths()[0].vertices for s in sets if s.filled and list(s.levels) == [-1.0, 1.0]]
+    """Return the vertices of the bands of the standard error."""
+    sets = [
+        artist
+        for artist in figure.axes[0].collections
+        if isinstance(artist, QuadContourSet)
+        and artist.filled
+        and same_color(artist.get_facecolor()[0], STANDARD_ERROR["color"])
+    ]
+    return [np.asarray(artist.get_paths()[0].vertices) for artist in sets]
 
 
 def error_bars(figure: Figure, panel: int = 0) -> list[np.ndarray]:
@@ -95,22 +99,6 @@ def test_curves_of_the_shear_stress_ratio_have_a_panel_on_the_scale_of_the_force
             data.stress_ratio_stderr[:, k, 0, 1].values,
         )
         np.testing.assert_allclose(ends, shear[:, None] + error[:, None] * [-1.0, 1.0], rtol=1e-12)
-
-
-def test_every_point_is_a_curve_against_the_time_step_with_its_errors() -> None:
-    data = with_timesteps(ratio_dataset(3, 3), 1e-3, 1e-4, 1e-5)
-    curves = [
-        container for axes in ratio_against_timestep(data).axes for container in axes.containers
-    ]
-    points = [
-        (nu, alpha) for nu in data.packing_fraction.values for alpha in data.restitution.values
-    ]
-    for container, (nu, alpha) in zip(curves, points, strict=True):
-        point = data.sel(packing_fraction=nu, restitution=alpha).sortby("timestep")
-        expected = np.stack([point.timestep, point.force_ratio], -1)
-        np.testing.assert_array_equal(container.lines[0].get_xydata(), expected)
-        ends = np.array([segment[:, 1] for segment in container.lines[2][0].get_segments()])
-        np.testing.assert_allclose(np.diff(ends)[:, 0], 2.0 * point.force_ratio_stderr, rtol=1e-9)
 
 
 @pytest.mark.parametrize(

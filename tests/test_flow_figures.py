@@ -10,16 +10,24 @@ import jax
 import numpy as np
 import pytest
 from matplotlib import animation
-from matplotlib.collections import EllipseCollection, LineCollection
-from matplotlib.patches import Polygon
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection, PolyCollection
 from PIL import Image, ImageSequence
 from synthetic import snapshot_of
 
-from jaxgran.analysis.contacts import pair_forces
 from jaxgran.plotting import flow, movie
-from jaxgran.plotting.drawing import empty_figure
-from jaxgran.plotting.flow import Scale, common_scale, draw_scene, flow_figure, scene_of
+from jaxgran.plotting.flow import (
+    Artists,
+    Scale,
+    common_scale,
+    draw_flow,
+    flow_figure,
+    network_of,
+    pressures,
+    title_of,
+)
 from jaxgran.plotting.movie import Frames, check_movie, write_movie
+from jaxgran.plotting.style import empty_figure
 
 SIDE, GRAINS = 8.0, 40
 
@@ -40,28 +48,19 @@ def seen(
     )
 
 
-def drawn(scene, scale: Scale | None = None):
+def drawn(network, scale: Scale | None = None) -> tuple[Axes, Artists]:
     axes = empty_figure(4, 4).subplots()
-    draw_scene(axes, scene, "speed", scale or common_scale([scene], "speed"))
-    (grains,) = (artist for artist in axes.collections if isinstance(artist, EllipseCollection))
-    clusters, binaries = (
-        artist for artist in axes.collections if isinstance(artist, LineCollection)
-    )
-    (cell,) = (artist for artist in axes.patches if isinstance(artist, Polygon))
-    return grains, clusters, binaries, cell
+    scale = scale or common_scale([network], "speed")
+    return axes, draw_flow(axes, network, "speed", scale)
 
 
-def area_within(grains: EllipseCollection, cell: Polygon, points: int = 400) -> float:
-    """Share of the cell that is covered, where grains do not overlap the sum over them of the area
-    inside.
+def area_within(grains: EllipseCollection, axes: Axes, points: int = 400) -> float:
+    """Share of the window that is covered, where grains do not overlap the sum over them of the
+    area inside.
     """
-    corners = cell.get_xy()[:-1]
     u = (np.arange(points) + 0.5) / points
-    mesh = (
-        corners[0]
-        + u[:, None, None] * (corners[1] - corners[0])
-        + u[:, None] * (corners[3] - corners[0])
-    )
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    mesh = np.stack(np.meshgrid(left + (right - left) * u, low + (high - low) * u), axis=-1)
     centres, radii = grains.get_offsets(), grains.get_widths() / 2
     inside = [
         np.sum((mesh - centre) ** 2, axis=-1) < radius**2
@@ -70,40 +69,49 @@ def area_within(grains: EllipseCollection, cell: Polygon, points: int = 400) -> 
     return float(np.mean(np.sum(inside, axis=0)))
 
 
+def bars_of(artist: PolyCollection) -> np.ndarray:
+    """Return x and y of the middle, half the branch and the width of each bar, (bars, 5)."""
+    corners = np.array([path.vertices[:6] for path in artist.get_paths()])
+    middle, half = corners.mean(axis=1), (corners[:, 0] + corners[:, 2]) / 2
+    width = np.linalg.norm(corners[:, 0] - corners[:, 2], axis=-1)
+    return np.column_stack([middle, half - middle, width])
+
+
 @pytest.mark.parametrize("tilt", [-0.5, 0.0, 0.2])
 def test_grains_cut_at_the_edges_and_their_images_make_whole_grains(tilt: float) -> None:
-    """The parts of the images within the cell sum up to the area of all grains: none is missing,
+    """The parts of the images within the window sum up to the area of all grains: none is missing,
     none twice there.
     """
-    scene = scene_of(seen(tilt))
-    grains, *_, cell = drawn(scene)
-    assert area_within(grains, cell) == pytest.approx(GRAINS * np.pi / 4 / SIDE**2, rel=2e-3)
+    axes, artists = drawn(network_of(seen(tilt)))
+    expected = GRAINS * np.pi / 4 / SIDE**2
+    assert area_within(artists.grains, axes) == pytest.approx(expected, rel=2e-3)
 
 
-def test_lines_join_the_centres_of_grains_that_push_in_widths_by_their_forces() -> None:
-    scene = scene_of(seen(0.2))
-    _, clusters, binaries, _ = drawn(scene, Scale(1.0, 2.0))
-    widths = {*clusters.get_linewidths(), *binaries.get_linewidths()}
-    assert max(widths) == flow.WIDEST_LINE
-    np.testing.assert_allclose(sorted(widths), flow.WIDEST_LINE * np.array([0.25, 0.5, 1.0]))
-    start, end = (scene.instant.positions[k] for k in (4, 3))
-    (middle,) = (
-        line for line in binaries.get_segments() if np.allclose(line[0], start)
-    )  # the image not shifted
-    lattice = np.linalg.solve(np.array([[SIDE, 0.2 * SIDE], [0, SIDE]]), middle[1] - end)
-    np.testing.assert_allclose(lattice, np.round(lattice), atol=1e-9)
-    assert np.linalg.norm(middle[1] - middle[0]) < SIDE
+def test_bars_join_the_centres_of_grains_that_push_in_widths_by_their_forces() -> None:
+    network = network_of(seen(0.2))
+    _, artists = drawn(network, Scale(1.0, 2.0))
+    clusters, binaries = bars_of(artists.clusters), bars_of(artists.binaries)
+    widths = flow.WIDEST_BAR * np.array([0.5, 1.0])
+    np.testing.assert_allclose(sorted(set(clusters[:, 4].round(9))), widths)
+    np.testing.assert_allclose(binaries[:, 4], flow.WIDEST_BAR / 4)
+    start, end = (network.positions[k] for k in (4, 3))
+    middle = binaries[0]
+    ends = middle[:2] - middle[2:4], middle[:2] + middle[2:4]
+    cell = np.array([[SIDE, 0.2 * SIDE], [0, SIDE]])
+    for found, expected in zip(ends, (start, end), strict=True):
+        lattice = np.linalg.solve(cell, found - expected)
+        np.testing.assert_allclose(lattice, np.round(lattice), atol=1e-9)
+    assert 2 * np.linalg.norm(middle[2:4]) < SIDE
 
 
 def test_colours_are_the_speed_and_the_pressure_of_the_contacts() -> None:
     one = seen()
-    scene = scene_of(one)
-    np.testing.assert_allclose(scene.speed, np.linalg.norm(one.state.velocities[0], axis=-1))
+    network = network_of(one)
+    np.testing.assert_allclose(network.speed, np.linalg.norm(one.state.velocities[0], axis=-1))
     pushed = np.zeros(GRAINS)
     pushed[:5] = 2.0, 3.0, 1.0, 0.5, 0.5
-    np.testing.assert_allclose(scene.pressure, pushed * 0.5 / (2 * np.pi * 0.25))
-    grains = drawn(scene)[0]
-    assert set(grains.get_array()) == set(scene.speed)
+    np.testing.assert_allclose(pressures(network), pushed * 0.5 / (2 * np.pi * 0.25))
+    assert set(drawn(network)[1].grains.get_array()) == set(network.speed)
 
 
 def test_pressures_of_grains_of_one_size_sum_up_to_the_contact_stress() -> None:
@@ -111,22 +119,19 @@ def test_pressures_of_grains_of_one_size_sum_up_to_the_contact_stress() -> None:
     positions = np.zeros((1, GRAINS, 2))
     positions[0, :, 0] = np.arange(GRAINS) % 8 * 1.0
     positions[0, :, 1] = np.arange(GRAINS) // 8 * 1.5
-    scene = scene_of(snapshot_of(positions, [[(0, 1, 2.0), (2, 1, 3.0)]], side=SIDE))
-    assert np.sum(np.pi * scene.instant.radii**2 * scene.pressure) == pytest.approx(
-        (2.0 + 3.0) * 1.0 / 2
-    )
+    network = network_of(snapshot_of(positions, [[(0, 1, 2.0), (2, 1, 3.0)]], side=SIDE))
+    total = np.sum(np.pi * network.radii**2 * pressures(network))
+    assert total == pytest.approx((2.0 + 3.0) * 1.0 / 2)
 
 
 def test_forces_of_a_series_are_means_over_its_times() -> None:
     """A pair counts to the clusters where most of its force acts within them."""
     contacts = [[(0, 1, 3.0)], [(1, 0, 1.0), (2, 1, 4.0)], [(5, 6, 2.0)], []]
     positions = np.random.default_rng(0).uniform(0, SIDE, (1, GRAINS, 2)).repeat(4, axis=0)
-    series = snapshot_of(positions, contacts, side=SIDE)
-    found = pair_forces(series)
-    np.testing.assert_array_equal(found.pairs, [[0, 1], [1, 2], [5, 6]])
-    np.testing.assert_allclose(found.force, [1.0, 1.0, 0.5])
-    np.testing.assert_allclose(found.cluster_share, [0.25, 1.0, 0.0])
-    np.testing.assert_array_equal(scene_of(series).instant.clustered, [False, True, False])
+    network = network_of(snapshot_of(positions, contacts, side=SIDE))
+    np.testing.assert_array_equal(network.pairs, [[0, 1], [1, 2], [5, 6]])
+    np.testing.assert_allclose(network.force, [1.0, 1.0, 0.5])
+    np.testing.assert_array_equal(network.clustered, [False, True, False])
 
 
 def test_picture_is_the_same_in_any_unit_of_time() -> None:
@@ -139,7 +144,8 @@ def test_picture_is_the_same_in_any_unit_of_time() -> None:
         impulses=other.impulses * 2,
         state=replace(other.state, velocities=other.state.velocities * 2),
     )
-    jax.tree.map(np.testing.assert_array_equal, scene_of(one), scene_of(other))
+    jax.tree.map(np.testing.assert_array_equal, network_of(one), network_of(other))
+    assert title_of(one) == title_of(other)
 
 
 @pytest.mark.parametrize("contacts", [(), ((0, 1, 0.0),)], ids=["no contacts", "no forces"])
@@ -165,15 +171,18 @@ def seen_once(k: int):
     return jax.tree.map(lambda x: np.asarray(x[0]), seen(tilt=(0.1 * k + 0.5) % 1 - 0.5, seed=k))
 
 
-def test_gif_has_all_frames_and_they_differ(tmp_path: Path) -> None:
+@pytest.mark.parametrize("flows", [1, 2])
+def test_gif_has_all_frames_and_they_differ(flows: int, tmp_path: Path) -> None:
     path = tmp_path / "flow.gif"
     path.write_bytes(b"old")
-    write_movie(path, kept(6))
+    write_movie(path, *[kept(6)] * flows)
     assert [file.name for file in tmp_path.iterdir()] == ["flow.gif"]
     with Image.open(path) as film:
-        assert film.n_frames == 6 and film.info["duration"] == 50 and film.info.get("loop") == 0
+        assert film.n_frames == 6 and film.info["duration"] == 80 and film.info.get("loop") == 0
         pictures = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
+    (height, width, _) = pictures[0].shape
     assert {picture.shape for picture in pictures} == {pictures[0].shape}
+    assert (width > height) == (flows == 2)  # they are beside each other
     for one, other in pairwise(pictures):
         assert np.mean(one != other) > 0.02
 
@@ -184,10 +193,11 @@ def test_too_many_frames_are_thinned_evenly(monkeypatch) -> None:
     one = seen_once(0)
     for step in range(50):
         frames.keep(one, step)
-    assert 4 <= len(frames.strains) <= 8
-    assert len(set(np.diff(frames.strains))) == 1 and frames.strains[0] == 0
+    strains = [frame.strain for frame in frames.frames]
+    assert 4 <= len(strains) <= 8
+    assert len(set(np.diff(strains))) == 1 and strains[0] == 0
     frames.keep(one, 0)
-    assert frames.strains == [0.0]
+    assert [frame.strain for frame in frames.frames] == [0.0]
 
 
 def test_a_movie_that_is_interrupted_leaves_the_old_file(tmp_path: Path) -> None:

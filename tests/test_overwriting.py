@@ -19,7 +19,7 @@ from drawn import write_without_drawing
 from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.results import open_map
 from jaxgran.model.status import Status
-from jaxgran.plotting.theory import SHARES
+from jaxgran.plotting.theory import CLUSTERS
 from jaxgran.sampling.budget import LARGE_SYSTEM
 
 MAP = ("map", *POINTS, "--seeds", "1")
@@ -32,7 +32,7 @@ def made_up_maps(patch: pytest.MonkeyPatch) -> None:
     Their own files have what is printed and what decides which pictures there are.
     """
     write_without_drawing(patch)
-    write_few_variables(patch, *LARGE_SYSTEM, *SHARES)
+    write_few_variables(patch, *LARGE_SYSTEM, *CLUSTERS)
     patch.setattr(ratio_map_module, "run_replicas", made_up_replicas(BOTH))
 
 

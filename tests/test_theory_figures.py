@@ -1,5 +1,5 @@
-"""Errors of the theory, shares of the clusters and laws of dense flow are drawn as numbers at their
-places.
+"""Errors of the theory, factors of the pressure and shares of the clusters are drawn as numbers at
+their places.
 """
 
 from pathlib import Path
@@ -8,57 +8,41 @@ import numpy as np
 import pytest
 import xarray as xr
 from drawn import contour_lines, write_without_drawing
-from made_up_maps import (
-    STDERR,
-    assumption_of,
-    closure_of,
-    factor_of,
-    theory_dataset,
-)
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from made_up_maps import STDERR, assumption_of, closure_of, factor_of, theory_dataset
 
-from jaxgran.plotting.enskog_factors import LENGTH_PANEL, PANELS, enskog_factors
+from jaxgran.plotting.factors import FACTORS, enskog_factors
 from jaxgran.plotting.map_figures import save_figures
 from jaxgran.plotting.ratio import ratio_contours, ratio_curves
 from jaxgran.plotting.theory import ERROR_LEVELS, cluster_shares, error_parts, theory_errors
-
-
-def panel(figure: Figure, name: str) -> Axes:
-    """Return the axes of the shares of pressure "p" or shear stress "s", or those of the map
-    "m".
-    """
-    return {axes.get_label(): axes for axes in figure.axes}[name]
-
 
 # ----------------------------------------------------------------------------------------------
 # theory
 
 
 @pytest.mark.parametrize("quantity", ["pressure", "shear_stress"])
-def test_error_is_that_of_the_assumption_plus_that_of_the_closure(quantity: str) -> None:
+def test_errors_are_those_of_all_assumptions_and_of_the_binary_one(quantity: str) -> None:
     data = theory_dataset()
     parts = {name: value for name, (value, _) in error_parts(data, quantity).items()}
     x, nu = 1.0 - data.restitution.values[None, :], data.packing_fraction.values[:, None]
-    np.testing.assert_allclose(parts["total"], parts["assumption"] + parts["closure"], atol=1e-14)
-    np.testing.assert_allclose(parts["assumption"], assumption_of(x, nu), atol=1e-14)
-    np.testing.assert_allclose(parts["closure"], closure_of(x, nu), atol=1e-14)
+    binary = assumption_of(x, nu)
+    np.testing.assert_allclose(parts["total"], binary + closure_of(x, nu), atol=1e-14)
+    np.testing.assert_allclose(parts["binary"], binary, atol=1e-14)
 
 
 def test_standard_error_of_the_assumption_is_that_of_the_stress_ratio() -> None:
     data = theory_dataset()
     data["stress_ratio"][..., 0, 1] = -2.0  # the other component, and its sign, do not matter
-    value, error = error_parts(data, "pressure")["assumption"]
+    value, error = error_parts(data, "pressure")["binary"]
     changed = data.assign({"stresses/binary_stress": data["stresses/binary_stress"] / (1.0 + 1e-4)})
-    slope = (error_parts(changed, "pressure")["assumption"][0] - value) / 1e-4
+    slope = (error_parts(changed, "pressure")["binary"][0] - value) / 1e-4
     np.testing.assert_allclose(error, np.abs(slope) * STDERR, rtol=1e-3)
-    _, shear_error = error_parts(data, "shear_stress")["assumption"]
+    _, shear_error = error_parts(data, "shear_stress")["binary"]
     np.testing.assert_allclose(shear_error, error / 2.0)
 
 
 def test_errors_lie_on_their_isolines() -> None:
-    grid = np.reshape(theory_errors(theory_dataset()).axes, (2, 3))
-    laws = (lambda x, nu: assumption_of(x, nu) + closure_of(x, nu)), assumption_of, closure_of
+    grid = np.reshape(theory_errors(theory_dataset()).axes, (2, 2))
+    laws = (lambda x, nu: assumption_of(x, nu) + closure_of(x, nu)), assumption_of
     for row in grid:
         for axes, law in zip(row, laws, strict=True):
             lines = contour_lines(axes, "black")
@@ -75,20 +59,21 @@ def test_errors_lie_on_their_isolines() -> None:
 # factors
 
 
-def test_factors_lie_on_their_isolines() -> None:
-    figure = enskog_factors(theory_dataset())
-    assert [axes.get_title() for axes in figure.axes] == [*PANELS.values(), LENGTH_PANEL]
-    for k, axes in enumerate(figure.axes):
-        corners = factor_of(k, *np.meshgrid([0.1, 0.9], [0.3, 0.8]))
-        lines = contour_lines(axes, "black")
-        reached = {
-            level for level in ERROR_LEVELS.values() if corners.min() < level < corners.max()
-        }
-        assert set(lines) <= reached and len(lines) >= min(
-            1, len(reached)
-        )  # a short one lies under its label
-        for level, vertices in lines.items():
-            np.testing.assert_allclose(factor_of(k, *vertices.T), level, atol=1e-9)
+def test_factors_and_their_product_are_curves_with_names_at_their_ends() -> None:
+    data = theory_dataset()
+    figure = enskog_factors(data)
+    assert [axes.get_title() for axes in figure.axes] == [
+        rf"$\alpha={alpha:g}$" for alpha in (0.9, 0.5, 0.1)
+    ]
+    nu = data.packing_fraction.values
+    for axes, alpha in zip(figure.axes, (0.9, 0.5, 0.1), strict=True):
+        logs = [factor_of(k, 1 - alpha + 0 * nu, nu) for k in range(len(FACTORS))]
+        for bars, log in zip(axes.containers, logs, strict=True):
+            np.testing.assert_allclose(bars.lines[0].get_xydata(), np.stack([nu, np.exp(log)], -1))
+        (product,) = (line for line in axes.lines if line.get_linewidth() == 2.2)
+        np.testing.assert_allclose(product.get_ydata(), np.exp(np.sum(logs, axis=0)))
+    names = [text.get_text() for text in figure.axes[-1].texts]
+    assert sorted(names) == sorted(["measured/Enskog", *(name for name, *_ in FACTORS.values())])
 
 
 # --------------------------------------------------------------------------------------------
@@ -97,22 +82,17 @@ def test_factors_lie_on_their_isolines() -> None:
 
 def test_shares_stand_at_their_excess_with_errors_in_both_directions() -> None:
     data = theory_dataset()
-    data["stresses/cluster_shear_share"] = 0.9 * data["stresses/cluster_shear_share"]
-    figure = cluster_shares(data)
-    for axes, name in (
-        (panel(figure, "p"), "stresses/cluster_pressure_share"),
-        (panel(figure, "s"), "stresses/cluster_shear_share"),
-    ):
-        bars = axes.containers
-        assert len(bars) == data.sizes["restitution"] and axes.get_xscale() == "log"
-        drawn = np.array([c.lines[0].get_xydata() for c in bars])
-        np.testing.assert_allclose(drawn[..., 0], (data.force_ratio - 1.0).T)
-        np.testing.assert_allclose(drawn[..., 1], data[name].T)
-        across, along = (np.array([c.lines[2][k].get_segments() for c in bars]) for k in (0, 1))
-        np.testing.assert_allclose(np.ptp(across[..., 0], axis=-1), 2.0 * data.force_ratio_stderr.T)
-        np.testing.assert_allclose(np.ptp(along[..., 1], axis=-1), 0.06)
-        left, right = axes.get_xlim()
-        assert left < drawn[..., 0].min() and drawn[..., 0].max() < right
+    axes = cluster_shares(data).axes[0]
+    bars = axes.containers
+    assert len(bars) == data.sizes["restitution"] and axes.get_xscale() == "log"
+    drawn = np.array([c.lines[0].get_xydata() for c in bars])
+    np.testing.assert_allclose(drawn[..., 0], (data.force_ratio - 1.0).T)
+    np.testing.assert_allclose(drawn[..., 1], data["stresses/cluster_pressure_share"].T)
+    across, along = (np.array([c.lines[2][k].get_segments() for c in bars]) for k in (0, 1))
+    np.testing.assert_allclose(np.ptp(across[..., 0], axis=-1), 2.0 * data.force_ratio_stderr.T)
+    np.testing.assert_allclose(np.ptp(along[..., 1], axis=-1), 0.06)
+    left, right = axes.get_xlim()
+    assert left < drawn[..., 0].min() and drawn[..., 0].max() < right
 
 
 # ---------------------------------------------------------------------------------------------
@@ -134,7 +114,7 @@ def test_map_without_any_value_is_drawn(draw) -> None:
     ("data", "names"),
     [
         (theory_dataset(3, 3), ["curves", "contours", "theory", "factors", "clusters"]),
-        (theory_dataset(1, 3), ["curves", "clusters"]),
+        (theory_dataset(1, 3), ["curves", "factors", "clusters"]),
         (
             theory_dataset(3, 3).drop_vars("theory/pressure"),
             ["curves", "contours", "factors", "clusters"],

@@ -180,10 +180,10 @@ def _write_frames(files: FrameFiles, frames: int, film, quiet: bool) -> None:
         say(f"wrote {files.trajectory}: {frames} frames")
     if files.movie is not None:
         if not quiet:
-            say(f"drawing {len(film.scenes)} frames")
+            say(f"drawing {len(film)} frames")
         follow = iter if quiet else partial(counted, words="frames")
         write_movie(files.movie, film, follow=follow)
-        say(f"wrote {files.movie}: {len(film.scenes)} frames")
+        say(f"wrote {files.movie}: {len(film)} frames")
 
 
 def _entries(data) -> dict[str, Entry]:

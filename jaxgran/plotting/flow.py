@@ -1,47 +1,37 @@
-"""Pictures of a flow: grains in their sheared cell, coloured by speed or pressure, and the forces
-between them.
+"""Pictures of a flow: its grains, coloured by speed or pressure, and the forces between them.
 
-Lines join the centres of grains that push each other. Their width is proportional to the force,
-within limits. A line is black if most of its force acts within clusters of three or more grains. It
-is red, and much lighter in a grey print, if the two grains collide without touching others.
+The window is a square of the side of the periodic cell, so that each grain is there once; what is
+cut at an edge continues at the opposite one, shifted by the shear at top and bottom. Bars join the
+centres of grains that push each other, as wide as the force is large, within limits. A bar is black
+if most of its force acts within clusters of three or more grains. It is red, and much lighter in a
+grey print, if the two grains collide without touching others.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.collections import EllipseCollection, PolyCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Polygon
-from matplotlib.text import Annotation, Text
+from matplotlib.patches import Patch
 
 from jaxgran.analysis.contacts import ForceNetwork, force_network
 from jaxgran.analysis.series import series
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.checks import InputError, require_untraced, short_repr
-from jaxgran.plotting.drawing import (
-    LABEL_SIZE,
-    SMALL_SIZE,
-    TICK_SIZE,
-    empty_figure,
-    image_segments,
-    scientific,
-)
 from jaxgran.plotting.encoding import (
     BINARY_COLOUR,
     CLUSTER_COLOUR,
     GRAIN_EDGE,
     GRAIN_RAMPS,
-    THINNEST_LINE,
-    WIDEST_LINE,
     deepest,
     widest,
 )
+from jaxgran.plotting.style import ONE_COLUMN, empty_figure, scientific, styled
 
 Colour = Literal["speed", "pressure"]
 
@@ -52,38 +42,12 @@ COLOUR_LABELS: dict[str, str] = {
 COLOURS = {
     name: LinearSegmentedColormap.from_list(name, ramp) for name, ramp in GRAIN_RAMPS.items()
 }
-_CLUSTER: dict[str, Any] = {"color": CLUSTER_COLOUR, "capstyle": "round"}
-_BINARY: dict[str, Any] = {"color": BINARY_COLOUR, "capstyle": "round"}
-_LEGEND: dict[str, Any] = {
-    "fontsize": SMALL_SIZE,
-    "frameon": False,
-    "ncols": 3,
-    "handlelength": 1.8,
-    "columnspacing": 1.4,
-}
-_LATTICE = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]  # the cell and its eight neighbours
-_LINE_MARGIN = 0.05  # in sides of the cell, at least half of the width of a line
-
-
-class Scene(NamedTuple):
-    """What a picture shows of a flow, in units of σ, m and 1/γ̇."""
-
-    instant: ForceNetwork
-    pressure: Float[np.ndarray, " grains"]  # Σ F r/2πr² over the contacts of each grain
-    restitution: float
-    packing_fraction: float
-    timestep: float
-    times: int  # number of snapshots in the window
-    window: float  # strain of the window; whole numbers between snapshots are not counted
-
-    @property
-    def speed(self) -> Float[np.ndarray, " grains"]:
-        """|c|, without the shear."""
-        return self.instant.speed
+WIDEST_BAR, THINNEST_BAR = 0.45, 0.05  # in σ, bars of the largest and of the smallest force
+_LATTICE = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)])  # a cell and its neighbours
 
 
 class Scale(NamedTuple):
-    """The values of the deepest colour and the widest line of a picture; larger values look the
+    """The values of the deepest colour and the widest bar of a picture; larger values look the
     same.
 
     ``colour`` is a speed in σγ̇ or a pressure in mγ̇², ``force`` a force in mσγ̇².
@@ -93,6 +57,15 @@ class Scale(NamedTuple):
     force: float
 
 
+class Artists(NamedTuple):
+    """What differs from picture to picture of a flow, in the order in which it is drawn."""
+
+    grains: EllipseCollection
+    clusters: PolyCollection
+    binaries: PolyCollection
+
+
+@styled
 def flow_figure(seen: Snapshot, colour: Colour = "speed", strain: float | None = None) -> Figure:
     """A picture of a flow: its grains and the forces between them.
 
@@ -108,106 +81,64 @@ def flow_figure(seen: Snapshot, colour: Colour = "speed", strain: float | None =
     Raises:
       ValueError: ``seen`` is not such a snapshot or not finite, or the colour is unknown.
     """
-    scene = scene_of(seen)
-    require_colour(colour)
-    figure = empty_figure(5.4, 5.4)
-    draw_picture(figure.subplots(), scene, colour, common_scale([scene], colour), strain)
+    if colour not in get_args(Colour):
+        raise InputError(f"colour must be speed or pressure, not {short_repr(colour)}.")
+    network = network_of(seen)
+    scale = common_scale([network], colour)
+    figure = empty_figure(1.5 * ONE_COLUMN, 1.4 * ONE_COLUMN)
+    axes = figure.add_subplot(title=title_of(seen, strain))
+    add_colour_bar(axes, draw_flow(axes, network, colour, scale), colour)
+    figure.legend(handles=force_key(scale), loc="outside lower left", ncols=3, handlelength=1.2)
     return figure
 
 
-def require_colour(colour: Any) -> None:
-    """Raise an InputError unless the colour is "speed" or "pressure"."""
-    if colour not in get_args(Colour):
-        raise InputError(f"colour must be speed or pressure, not {short_repr(colour)}.")
-
-
-def scene_of(seen: Snapshot) -> Scene:
-    """The scene of a snapshot, or of a series of snapshots."""
+def network_of(seen: Snapshot) -> ForceNetwork:
+    """The grains and forces of a snapshot, or of a series of snapshots; checks that they can be
+    drawn.
+    """
     if not isinstance(seen, Snapshot) or np.ndim(seen.state.side) > 1:
         raise InputError(
             "seen must be a Snapshot of one flow or a series of them, not "
             f"{short_repr(type(seen).__name__)}."
         )
     require_untraced("flow_figure", "draw what the transformed function returns", seen)
-    frames = series(seen)
-    state, times = frames.state, len(frames.state.side)
-    middle = times // 2
-    if not (
-        np.isfinite(state.positions[middle]).all() and np.isfinite(state.velocities[middle]).all()
-    ):
+    if not (np.isfinite(seen.state.positions).all() and np.isfinite(seen.state.velocities).all()):
         raise InputError("seen must be a flow of finite positions and velocities.")
-    rate = frames.shear_rate[middle].item()
-    if not rate > 0:
+    if not (np.asarray(seen.shear_rate) > 0).all():
         raise InputError(
             "seen must be of a sheared flow: its shear rate is the unit of the picture."
         )
-    step, instant = frames.timestep[middle].item() * rate, force_network(seen)
-    radii = instant.radii
-    return Scene(
-        instant=instant,
-        pressure=np.bincount(instant.pairs.ravel(), np.repeat(instant.force, 2), len(radii))
-        / (2 * np.pi * radii),
-        restitution=frames.restitution[middle].item(),
-        packing_fraction=float(np.sum(np.pi * radii**2) / instant.side**2),
-        timestep=step,
-        times=times,
-        window=times * (step if times == 1 else float(np.mean(np.diff(state.tilt) % 1))),
-    )
+    return force_network(seen)
 
 
-def common_scale(scenes: Iterable[Scene], colour: Colour) -> Scale:
+def pressures(network: ForceNetwork) -> Float[np.ndarray, " grains"]:
+    """Σ F r/2πr² over the contacts of each grain, in mγ̇²."""
+    forces, radii = np.repeat(network.force, 2), network.radii
+    return np.bincount(network.pairs.ravel(), forces, len(radii)) / (2 * np.pi * radii)
+
+
+def common_scale(networks: Iterable[ForceNetwork], colour: Colour) -> Scale:
     """One scale for several pictures, so that they can be compared."""
-    scenes = list(scenes)
-    values = np.concatenate([getattr(scene, colour) for scene in scenes])
-    forces = np.concatenate([scene.instant.force for scene in scenes])
-    return Scale(deepest(values), widest(forces))
+    networks = list(networks)
+    values = np.concatenate([_values(network, colour) for network in networks])
+    return Scale(deepest(values), widest(np.concatenate([one.force for one in networks])))
 
 
-class Artists(NamedTuple):
-    """What differs from frame to frame in a picture, in the order in which it is drawn."""
-
-    grains: EllipseCollection
-    clusters: LineCollection
-    binaries: LineCollection
-    cell: Polygon
-    scale_bar: Line2D
-    scale_label: Annotation
-    title: Text
+def _values(network: ForceNetwork, colour: Colour) -> Float[np.ndarray, " grains"]:
+    return network.speed if colour == "speed" else pressures(network)
 
 
-def draw_picture(
-    axes: Axes, scene: Scene, colour: Colour, scale: Scale, strain: float | None = None
-) -> Artists:
-    """Draw a scene with its title, colour bar and legend."""
-    artists = draw_scene(axes, scene, colour, scale)
-    artists.title.set_text(title_of(scene, strain))
-    bar_axes = axes.inset_axes((1.02, 0.25, 0.022, 0.7))
-    bar = axes.figure.colorbar(artists.grains, cax=bar_axes, extend="max")
-    bar.set_label(COLOUR_LABELS[colour], fontsize=TICK_SIZE)
-    bar.ax.tick_params(labelsize=SMALL_SIZE)
-    axes.legend(handles=force_key(scale), loc="upper left", bbox_to_anchor=(0.0, 0.0), **_LEGEND)
-    return artists
+# ----------------------------------------------------------------------------------------------
+# drawing
 
 
-def draw_scene(axes: Axes, scene: Scene, colour: Colour, scale: Scale) -> Artists:
-    """Draw grains, forces, the cell and a scale bar.
-
-    Parts that reach over an edge of the cell are cut and drawn at the opposite edge.
-    """
-    side = scene.instant.side
-    length = max((n for n in (1, 2, 5, 10, 20, 50, 100) if n <= 0.3 * side), default=1)
-    half_width = 0.505 * side * (1 + abs(scene.instant.tilt))
-    low, high = -0.6 * side, 0.505 * side
-    axes.set(xlim=(-half_width, half_width), ylim=(low, high), aspect="equal")
-    axes.set_axis_off()
-    (scale_bar,) = axes.plot(
-        [0, length], [0, 0], color="black", linewidth=1.6, solid_capstyle="butt"
-    )
+def draw_flow(axes: Axes, network: ForceNetwork, colour: Colour, scale: Scale) -> Artists:
+    """Draw grains and forces in a square window."""
+    half = network.side / 2
+    axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal", xticks=(), yticks=())
     artists = Artists(
-        grains=EllipseCollection(
-            (),
-            (),
-            (),
+        EllipseCollection(
+            *((), (), ()),
             units="xy",
             offsets=np.zeros((0, 2)),
             offset_transform=axes.transData,
@@ -215,119 +146,84 @@ def draw_scene(axes: Axes, scene: Scene, colour: Colour, scale: Scale) -> Artist
             norm=Normalize(0, scale.colour),
             edgecolor=GRAIN_EDGE,
             linewidth=0.4,
-            zorder=1,
         ),
-        clusters=LineCollection([], zorder=2, **_CLUSTER),
-        binaries=LineCollection([], zorder=3, **_BINARY),
-        cell=Polygon(
-            np.zeros((4, 2)),
-            closed=True,
-            facecolor="none",
-            edgecolor="#404040",
-            linewidth=0.9,
-            zorder=4,
-        ),
-        scale_bar=scale_bar,
-        scale_label=axes.annotate(
-            rf"{length} $\sigma$",
-            (0, 0),
-            (4, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=TICK_SIZE,
-        ),
-        title=axes.set_title("", fontsize=LABEL_SIZE),
+        PolyCollection([], facecolor=CLUSTER_COLOUR, linewidth=0),
+        PolyCollection([], facecolor=BINARY_COLOUR, linewidth=0),
     )
-    axes.add_patch(artists.cell)
-    for artist in (artists.grains, artists.clusters, artists.binaries):
+    for artist in artists:
         axes.add_collection(artist, autolim=False)
-    show_scene(artists, scene, colour, scale)
+    show_flow(artists, network, colour, scale)
     return artists
 
 
-def show_scene(artists: Artists, scene: Scene, colour: Colour, scale: Scale) -> None:
-    """Show another scene of a cell of the same side by artists that are there."""
-    instant = scene.instant
-    corners = instant.side * np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-    corners[:, 0] += instant.tilt * corners[:, 1]
-    artists.cell.set_xy(corners)
-    which, places = _images(instant)
-    diameters = 2 * instant.radii[which]
-    artists.grains.set(
-        widths=diameters, heights=diameters, angles=np.zeros(which.size), offsets=places
-    )
-    artists.grains.set_array(getattr(scene, colour)[which])
-    segments, pairs = _segments(instant)
-    widths = np.clip(WIDEST_LINE * instant.force / scale.force, THINNEST_LINE, WIDEST_LINE)
-    in_clusters = instant.clustered[pairs]
-    for lines, chosen in ((artists.clusters, in_clusters), (artists.binaries, ~in_clusters)):
-        lines.set_segments(list(segments[chosen]))
-        lines.set(linewidths=widths[pairs[chosen]])
-    for artist in (artists.grains, artists.clusters, artists.binaries):
-        artist.set_clip_path(artists.cell)
-    start, length = -0.5 * instant.side * (1 + instant.tilt), np.ptp(artists.scale_bar.get_xdata())
-    low = -0.57 * instant.side
-    artists.scale_bar.set_data([start, start + length], [low, low])
-    artists.scale_label.xy = (start + length, low)
+def show_flow(artists: Artists, network: ForceNetwork, colour: Colour, scale: Scale) -> None:
+    """Show another instant of a flow by artists that are there."""
+    which, places = _images(network, network.positions, network.radii)
+    sizes = 2 * network.radii[which]
+    artists.grains.set(widths=sizes, heights=sizes, angles=0 * sizes, offsets=places)
+    artists.grains.set_array(_values(network, colour)[which])
+    i, j = network.positions[network.pairs.T]
+    branches = minimum_image(i - j, network.side, network.tilt)
+    lengths = np.linalg.norm(branches, axis=-1)
+    widths = np.clip(WIDEST_BAR * network.force / scale.force, THINNEST_BAR, WIDEST_BAR)
+    pairs, middles = _images(network, j + branches / 2, lengths / 2 + widths)
+    along = branches[pairs] / 2
+    across = along[:, ::-1] * [-1, 1] * (widths / lengths)[pairs, None]
+    tip = along * (1 + widths / lengths)[pairs, None]  # fills the corner to the next bar
+    corners = [along + across, tip, along - across, -along - across, -tip, -along + across]
+    bars = middles[:, None] + np.stack(corners, axis=1)
+    in_clusters = network.clustered[pairs]
+    artists.clusters.set_verts(list(bars[in_clusters]))
+    artists.binaries.set_verts(list(bars[~in_clusters]))
 
 
-def _segments(instant: ForceNetwork) -> tuple[np.ndarray, np.ndarray]:
-    """Lines and images of lines that reach into the cell: their ends (images, 2, 2) in σ, and
-    indices of the pairs.
-    """
-    i, j = instant.positions[instant.pairs.T]
-    branches = minimum_image(i - j, instant.side, instant.tilt)
-    shifts = instant.side * np.array([(a + instant.tilt * b, b) for a, b in _LATTICE])
-    ends = image_segments(j, branches, shifts)
-    along, up = ends[..., 0] - instant.tilt * ends[..., 1], ends[..., 1]
-    reach = (0.5 + _LINE_MARGIN) * instant.side
-    inside = np.all(
-        [(x.min(axis=-1) < reach) & (x.max(axis=-1) > -reach) for x in (along, up)], axis=0
-    )
-    return ends[inside], np.tile(np.arange(len(instant.force)), len(shifts))[inside]
-
-
-def _images(instant: ForceNetwork) -> tuple[np.ndarray, np.ndarray]:
-    """Grains and images that reach into the cell: indices of the grains (images,) and positions
+def _images(
+    network: ForceNetwork, points: np.ndarray, reach: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and their images that reach into the window: indices (images,) and positions
     (images, 2) in σ.
     """
-    side, tilt, radii = instant.side, instant.tilt, instant.radii[:, None]
-    places = instant.positions[:, None] + side * np.array([(a + tilt * b, b) for a, b in _LATTICE])
-    y = places[..., 1]
-    x = places[..., 0] - tilt * y
-    inside = (abs(x) <= side / 2 + radii * np.hypot(1, tilt)) & (abs(y) <= side / 2 + radii)
-    which, image = np.nonzero(inside)
+    shifts = network.side * (_LATTICE + network.tilt * _LATTICE[:, 1:] * [1, 0])
+    places = points[:, None] + shifts
+    which, image = np.nonzero((abs(places) <= network.side / 2 + reach[:, None, None]).all(axis=-1))
     return which, places[which, image]
 
 
-def force_key(scale: Scale) -> Sequence[Line2D]:
-    """The legend of the lines, with the force of the widest line."""
+def add_colour_bar(axes: Axes, artists: Artists, colour: Colour) -> None:
+    """Explain the colours of the grains at the right."""
+    label = COLOUR_LABELS[colour]
+    axes.figure.colorbar(artists.grains, ax=axes, label=label, extend="max", shrink=0.8, pad=0.02)
+
+
+def force_key(scale: Scale) -> list[Patch]:
+    """The legend of the bars, with the force of the widest one."""
     largest = rf"$F\geq{scientific(float(f'{scale.force:.1e}'))}\,m\sigma\dot\gamma^2$"
     keys = (
-        (_CLUSTER["color"], 2.5, "in clusters of 3 or more grains"),
-        (_BINARY["color"], 2.5, "binary collisions"),
-        ("#c4c4c4", WIDEST_LINE, f"widest: {largest}"),
+        (CLUSTER_COLOUR, "in clusters of 3 or more grains"),
+        (BINARY_COLOUR, "binary collisions"),
+        ("#c4c4c4", f"widest: {largest}"),
     )
-    return [
-        Line2D([], [], color=colour, linewidth=width, label=label) for colour, width, label in keys
-    ]
+    return [Patch(facecolor=colour, label=label) for colour, label in keys]
 
 
-def title_of(scene: Scene, strain: float | None = None) -> str:
-    """The title: parameters of the flow, and the time over which the forces are averaged."""
+def title_of(seen: Snapshot, strain: float | None = None) -> str:
+    """The parameters of a flow, and the time over which its forces are averaged."""
+    frames: Any = series(seen)
+    times, state = len(frames.state.side), frames.state
+    area, rate = np.pi * np.sum(state.grains.radii[0] ** 2), frames.shear_rate[0]
+    timestep = float(frames.timestep[0] * rate)
     parts = [
-        rf"$\alpha={scene.restitution:g}$",
-        rf"$\nu={scene.packing_fraction:.4g}$",
-        rf"$N={len(scene.pressure)}$",
-        rf"$\mathrm{{d}}t={scientific(scene.timestep)}/\dot\gamma$",
+        rf"$\alpha={frames.restitution[0]:g}$",
+        rf"$\nu={area / state.side[0] ** 2:.4g}$",
+        rf"$N={state.positions.shape[1]}$",
+        rf"$\mathrm{{d}}t={scientific(timestep)}/\dot\gamma$",
     ]
     if strain is not None:
         parts.append(f"strain {strain:.3f}")
-    every_step = abs(scene.window / (scene.times * scene.timestep) - 1) < 1e-3
-    window = (
-        f"{scene.times} time steps, a strain of {scene.window:.3g}"
-        if every_step
-        else f"{scene.times} snapshots"
-    )
-    forces = "forces of one time step" if scene.times == 1 else f"mean forces over {window}"
-    return f"{', '.join(parts)}\n{forces}"
+    if times == 1:
+        return f"{', '.join(parts)}\nforces of one time step"
+    between = float(np.mean(np.diff(state.tilt) % 1))
+    every_step = abs(between / timestep - 1) < 1e-3
+    window = f"{times} time steps, a strain of {times * between:.3g}"
+    mean = f"mean forces over {window if every_step else f'{times} snapshots'}"
+    return f"{', '.join(parts)}\n{mean}"

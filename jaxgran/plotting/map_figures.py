@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
@@ -10,13 +11,17 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from jaxgran.maps.schema import RATIO, MapData, require_map
-from jaxgran.model.checks import InputError, require_flag, require_whole, short_repr
+from jaxgran.model.checks import InputError, refused, require_flag, require_whole
 from jaxgran.model.choices import FileFormat
-from jaxgran.plotting.drawing import FILE_DPI, is_plane, writable_stem, write
-from jaxgran.plotting.enskog_factors import enskog_factors, has_factors
-from jaxgran.plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
-from jaxgran.plotting.size import averages_against_grains
+from jaxgran.plotting.against import averages_against_grains, ratio_against_timestep
+from jaxgran.plotting.factors import enskog_factors, has_factors
+from jaxgran.plotting.ratio import ratio_contours, ratio_curves
+from jaxgran.plotting.selection import is_plane
+from jaxgran.plotting.style import FILE_DPI, write
 from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
+
+# bytes of a stem; file systems accept 255, and the names of figures are longer than their stem
+_LONGEST_NAME = 200
 
 
 class MapFigure(NamedTuple):
@@ -32,7 +37,7 @@ FIGURES = {
     "timestep": MapFigure(ratio_against_timestep, lambda data: data.sizes.get("timestep", 1) >= 2),
     "size": MapFigure(averages_against_grains, lambda data: data.sizes.get("grains", 1) >= 2),
     "theory": MapFigure(theory_errors, lambda data: is_plane(data) and has_theory(data)),
-    "factors": MapFigure(enskog_factors, lambda data: is_plane(data) and has_factors(data)),
+    "factors": MapFigure(enskog_factors, has_factors),
     "clusters": MapFigure(cluster_shares, has_clusters),
 }
 """All figures of a map by the ending of their files, in the order in which they are drawn."""
@@ -60,8 +65,8 @@ def save_figures(
     `{stem}_size.png`        `averages_against_grains`   at least two numbers of grains
     `{stem}_theory.png`      `theory_errors`             a plane as for the contours, and the
                                                          predictions of the theory
-    `{stem}_factors.png`     `enskog_factors`            a plane, and the factors of the error of
-                                                         the theory
+    `{stem}_factors.png`     `enskog_factors`            two packing fractions, and the factors of
+                                                         the error of the theory
     `{stem}_clusters.png`    `cluster_shares`            the shares of the clusters
     =======================  ==========================  ===========================================
 
@@ -80,7 +85,7 @@ def save_figures(
     data = require_map(data, *RATIO)
     require_file(format, dpi)
     require_flag("overwrite", overwrite)
-    stem = writable_stem(stem)
+    stem = _writable(stem)
     drawn = {
         stem.with_name(f"{stem.name}_{name}.{format}"): one.draw
         for name, one in FIGURES.items()
@@ -93,6 +98,20 @@ def save_figures(
     for path in written:
         write(drawn[path](data), path, dpi, caption)
     return written
+
+
+def _writable(stem: Path | str) -> Path:
+    """Return folder and beginning of the names of figures; InputError if nothing can be written
+    there.
+    """
+    if not isinstance(stem, (str, os.PathLike)):
+        raise refused("stem", stem, "must be folder and beginning of the file names")
+    stem = Path(stem)
+    if len(os.fsencode(stem.name)) > _LONGEST_NAME:
+        raise refused("stem", stem.name, f"must have a name of at most {_LONGEST_NAME} bytes")
+    if not os.path.isdir(stem.parent) or not os.access(stem.parent, os.W_OK):
+        raise refused("stem", str(stem.parent), "must be in a folder that can be written to")
+    return stem
 
 
 def remove_pictures(path: Path, but: Iterable[Path] = ()) -> None:
@@ -112,5 +131,5 @@ def remove_pictures(path: Path, but: Iterable[Path] = ()) -> None:
 def require_file(format: Any, dpi: Any) -> None:
     """Raise an InputError unless figures can have this format and resolution."""
     if format not in get_args(FileFormat):
-        raise InputError(f"format must be png, pdf or svg, not {short_repr(format)}.")
+        raise refused("format", format, "must be png, pdf or svg")
     require_whole("dpi", dpi, 50, 1200, "as no print shows more")

@@ -1,0 +1,135 @@
+"""Which assumption of kinetic theory fails: the factors between Enskog's pressure and the measured
+one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from jaxgran.maps.schema import RATIO, MapData, what_lacks
+from jaxgran.plotting.selection import describe, selection, suspect
+from jaxgran.plotting.style import (
+    NU_LABEL,
+    RING,
+    SMALL_SIZE,
+    TWO_COLUMNS,
+    draw_points,
+    draw_reference,
+    empty_figure,
+    label_log_axis,
+    padded,
+    styled,
+)
+
+FACTORS = {
+    "local_temperature": ("local temperature", "#3a86b4", "o"),
+    "anisotropy": ("anisotropy", "#7f7f7f", "s"),
+    "chaos": ("molecular chaos", "#d08700", "^"),
+    "pairs": ("pairs at contact", "#8a5aa8", "D"),
+    "binary": ("binary collisions", "#c0392b", "v"),
+}
+"""Factors of the contact pressure: their names, colours and markers."""
+
+PREFIX = "theory/enskog_factor_pressure_"
+"""Beginning of the names of their variables."""
+
+_PRODUCT = ("measured/Enskog", "black", "")
+_NEEDED = [f"{PREFIX}{name}{end}" for name in FACTORS for end in ("", "_stderr")]
+_MOST_PANELS = 3
+_LABEL_HEIGHT = 0.07  # in heights of the panel
+
+
+def has_factors(data: xr.Dataset) -> bool:
+    """Return whether a map has the variables and the range that :func:`enskog_factors` draws."""
+    return data.sizes["packing_fraction"] >= 2 and not what_lacks(data, *RATIO, *_NEEDED)
+
+
+@styled
+def enskog_factors(data: MapData) -> Figure:
+    """Return the factors by which the contact pressure differs from Enskog's, and their product,
+    against the packing fraction.
+
+    Each factor is the pressure with one more assumption replaced by what was measured, over the
+    pressure before: see ``jaxgran.sampling.enskog_factors``. Their product, the measured pressure
+    over Enskog's, is the thick line. Each of at most three restitutions has a panel.
+
+    Args:
+      data: a map with `theory/enskog_factor_pressure_...` and `force_ratio`, with `_stderr`, and
+        `status`. The largest of several numbers of grains and the shortest of several time steps
+        are drawn.
+
+    Returns:
+      Error bars are one standard error; a point whose status is not `ok` is an open symbol in a
+      ring.
+    """
+    data = selection(data, *(f"{PREFIX}{name}" for name in FACTORS))
+    count = data.sizes["restitution"]
+    chosen = np.unique(np.round((count - 1) * np.linspace(0.9, 0.1, _MOST_PANELS)).astype(int))
+    figure = empty_figure(TWO_COLUMNS, height=3.0)
+    grid = figure.subplots(1, len(chosen), sharex=True, sharey=True, squeeze=False)[0]
+    ends: dict[str, float] = {}
+    for axes, k in zip(grid, chosen[::-1], strict=True):
+        ends = _draw_factors(axes, data.isel(restitution=k))
+        axes.set(title=rf"$\alpha={data.restitution.values[k]:.4g}$", xlabel=NU_LABEL)
+    grid[0].set(yscale="log", ylabel="factor of the contact pressure")
+    grid[0].set_xlim(padded(data.packing_fraction.values))
+    label_log_axis(grid[0].yaxis)
+    _label_ends(grid[-1], ends)
+    if suspect(data.isel(restitution=chosen)).any():
+        figure.legend(handles=[Line2D([], [], **RING)], loc="outside upper left")
+    shown = data.isel(restitution=chosen)
+    logs = np.log(
+        [shown[f"{PREFIX}{name}"].where(shown[f"{PREFIX}{name}"] > 0) for name in FACTORS]
+    )
+    right, all_right = (
+        (abs(np.expm1(log)) <= 0.1).sum() for log in (logs.sum(axis=0), abs(logs).max(axis=0))
+    )
+    describe(
+        figure,
+        data,
+        f"Enskog's contact pressure is right within 10 % at {right} of {logs[0].size} points, each "
+        f"of its assumptions at {all_right}{': errors cancel' if right > all_right else ''}",
+        "Each factor replaces one more assumption by what is measured; thick: their product",
+    )
+    return figure
+
+
+def _draw_factors(axes: Axes, data: xr.Dataset) -> dict[str, float]:
+    """Draw factors and product at one restitution; return the last value of each that is known."""
+    draw_reference(axes)
+    nu, bad = data.packing_fraction.values, suspect(data)
+    values = {name: data[f"{PREFIX}{name}"].values for name in FACTORS}
+    for name, (_, colour, marker) in FACTORS.items():
+        style = {"color": colour, "marker": marker, "markersize": 3}
+        error = data[f"{PREFIX}{name}_stderr"].values
+        draw_points(axes, nu, values[name], bad, style, yerr=error)
+    values["product"] = np.prod(list(values.values()), axis=0)
+    axes.plot(nu, values["product"], color=_PRODUCT[1], linewidth=2.2, zorder=3)
+    known = {name: value[np.isfinite(value) & (value > 0)] for name, value in values.items()}
+    return {name: value[-1] for name, value in known.items() if value.size}
+
+
+def _label_ends(axes: Axes, ends: dict[str, float]) -> None:
+    """Name the curves at their right ends, moved apart so that no name lies on another."""
+    names = sorted(ends, key=ends.__getitem__)
+    to_axes = axes.transData + axes.transAxes.inverted()
+    heights = np.array([to_axes.transform((0, ends[name]))[1] for name in names])
+    steps = _LABEL_HEIGHT * np.arange(len(names))
+    lowest = np.maximum.accumulate(heights - steps) + steps
+    highest = np.minimum.accumulate((heights - steps)[::-1])[::-1] + steps
+    for name, height in zip(names, (lowest + highest) / 2, strict=True):
+        text, colour, _ = (FACTORS | {"product": _PRODUCT})[name]
+        axes.annotate(
+            text,
+            (1.0, to_axes.transform((0, ends[name]))[1]),
+            (1.06, height),
+            xycoords="axes fraction",
+            color=colour,
+            fontsize=SMALL_SIZE,
+            va="center",
+            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.6},
+        )
