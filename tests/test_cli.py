@@ -245,9 +245,11 @@ def test_run_writes_frames_as_a_trajectory_and_as_a_movie(small_run) -> None:
 
 
 def parsed(text: str) -> dict[str, Any]:
-    """The JSON that a command prints: one object, in which every name has the same four keys."""
+    """The JSON that a command prints: one object, in which every name has the same keys."""
     found = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
-    assert all(list(entry) == ["value", "stderr", "unit", "meaning"] for entry in found.values())
+    assert all(
+        list(entry) == ["value", "stderr", "ci95", "unit", "meaning"] for entry in found.values()
+    )
     return found
 
 

@@ -71,7 +71,7 @@ def run_map_command(format: FileFormat = "png", quiet: bool = False, **given: An
     )
     if whole:
         print_tables(data)
-    finish(data, [*([output] if written else []), *pictures], interrupted, output)
+    finish(data, [*([output] if written else []), *pictures], interrupted, quiet, output)
 
 
 def require_new_figures(output: Path, format: FileFormat) -> None:
@@ -154,7 +154,7 @@ def _print_ratio(data) -> None:
     size = f"{data.attrs['grains']} grains, " if "grains" in data.coords else ""
     title = (
         f"Force ratio at {size}dt = {data.attrs['timestep']:g} / shear rate, {rule} activation; a "
-        "column is a restitution; *: see the status below"
+        "column is a restitution, * marks a bad status"
     )
     rows = []
     for nu in data.packing_fraction.values:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxgran.cli.options import with_options
-from jaxgran.cli.output import print_table
+from jaxgran.cli.output import print_table, print_text
 from jaxgran.cli.terminal import (
     BAD_STATUS,
     configured_jax,
@@ -26,19 +26,18 @@ from jaxgran.model.checks import refused
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import with_error
 
-_BUDGETED = (
-    "force_ratio",
-    "pressure",
-    "shear_stress",
-    "granular_temperature",
-    "local_granular_temperature",
-)
-_SMALLER = {  # sources of an error, with the options that make them smaller
-    "sampling": "sampling (--strain)",
-    "timestep": "time step (--timestep)",
-    "size": "size (--grains)",
-    "tolerance": "tolerance (--tolerance)",
+_BUDGETED = {
+    "force_ratio": "force ratio",
+    "pressure": "pressure",
+    "shear_stress": "shear stress",
+    "granular_temperature": "temperature",
+    "local_granular_temperature": "local temperature",
 }
+_SOURCES = {"sampling": "sampling", "timestep": "dt", "size": "size"}  # of errors above 0.4 %
+_SMALLER = (
+    "Smaller errors: of sampling by --strain or --seeds, of dt by --timestep, of the size by "
+    "--grains, of all by --error."
+)
 
 
 class Outcome(NamedTuple):
@@ -145,10 +144,10 @@ def print_large_system(data) -> None:
     if not np.isfinite(shown.force_ratio).any():
         return
     point = shown.status.size == 1
-    size = f"at N = {data.attrs['grains']}" if "grains" in data.attrs else "at its N"
+    size = f"N = {data.attrs['grains']}" if "grains" in data.attrs else "its N"
     values = (size, "large system") if point else ("change", "total")
-    title = "Averages of a large system, 95 % intervals, and the parts of their errors"
-    title += "" if point else ": median (largest)"
+    title = "Averages of a large system, ± 95 %, and the parts of their errors"
+    title += " in %" if point else " in %: median (largest)"
     if data.attrs.get("polydispersity") != MEASURED_POLYDISPERSITY:
         title += f"\n{shown.pressure_large_system.attrs['comment']}"
     rows = []
@@ -161,10 +160,11 @@ def print_large_system(data) -> None:
             cells = [with_error(at_size.item(), half), with_error(large.item(), whole)]
         else:
             cells = [_percent(large / at_size - 1), _percent(errors["total"])]
-        parts = {source: _percent(errors[source]) for source in _SMALLER}
-        parts |= {"timestep": "at its dt"} if name == "force_ratio" else {}
-        rows.append([name.replace("_", " "), *cells, *parts.values()])
-    print_table(title, ("observable", *values, *_SMALLER.values()), rows)
+        parts = {source: _percent(errors[source]) for source in _SOURCES}
+        parts |= {"timestep": "–"} if name == "force_ratio" else {}
+        rows.append([_BUDGETED[name], *cells, *parts.values()])
+    print_table(title, ("average", *values, *_SOURCES.values()), rows)
+    print_text(_SMALLER)
 
 
 def _percent(part) -> str:
@@ -178,18 +178,21 @@ def _percent(part) -> str:
         return ""
     largest = known.flat[np.argmax(abs(known))]
     median, largest = (f"{float(f'{100 * x:.2g}'):g}" for x in (np.median(known), largest))
-    return f"{median} %" if part.size == 1 else f"{median} ({largest}) %"
+    return median if part.size == 1 else f"{median} ({largest})"
 
 
-def finish(data, written: list[Path], interrupted: bool, output: Path | None = None) -> None:
-    """Print what was written and what went wrong, and exit with the matching status.
+def finish(
+    data, written: list[Path], interrupted: bool, quiet: bool = False, output: Path | None = None
+) -> None:
+    """Print what was written, unless quiet, and what went wrong; exit with the matching status.
 
     A map that was interrupted goes on from the folder beside its output, if there is one.
     """
     from jaxgran.maps.status_report import bad_points, bad_points_message, short_samples_message
 
-    say_written(written)
-    _say_imprecise(data)
+    if not quiet:
+        say_written(written)
+        _say_imprecise(data)
     bad = bad_points(data)
     short = bad.pop("short_sample", [])
     if short:

@@ -26,7 +26,7 @@ _MOST_DIGITS = 20  # of a whole number
 _LIST = f"or a list like 0.1,0.5,0.9 or start:stop:count with a count of 2 to {MAX_REPLICAS}"
 _WHOLE_LIST = "or a list like 256,1000,4000"
 FILE = Option("Dataset of a map.", Path)
-QUIET = Option("No progress on standard error.", bool, short="q")
+QUIET = Option("Say on standard error what went wrong only.", bool, short="q")
 OVERWRITE = Option("Replace the output, whatever it holds.", bool)
 
 

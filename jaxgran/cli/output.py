@@ -7,6 +7,7 @@ key      content
 =======  ===========================================================================================
 value    a number, a text, true or false, or nested lists of numbers; null for a number that is NaN
 stderr   standard error in the form of the value; null where there is none
+ci95     half-width of the 95 % interval with all errors; null where there is none
 unit     in m, sigma and t, as in a map; "1" for a pure number, null for what is none
 meaning  in words
 =======  ===========================================================================================
@@ -27,7 +28,7 @@ from rich.table import Table
 from jaxgran.maps.options import Option
 
 JSON = Option(
-    "Print one JSON object in place of tables: value, stderr, unit and meaning by name.", bool
+    "Print one JSON object in place of tables: value, errors, unit and meaning by name.", bool
 )
 _IN_ASCII = str.maketrans(
     {"±": "+-", "σ": "sigma", "γ": "gamma", "\u0307": "-dot", "ν": "nu", "α": "alpha", "²": "^2"}
@@ -37,7 +38,7 @@ _IN_ASCII = str.maketrans(
 
 def print_text(text: str) -> None:
     """Print sentences in lines that fit the terminal."""
-    Console(highlight=False, markup=False, emoji=False).print(_letters(text), soft_wrap=False)
+    Console(highlight=False, markup=False, emoji=False).print(_letters(text))
 
 
 def print_table(
@@ -47,16 +48,24 @@ def print_table(
 
     All columns but the first are right-aligned, or left-aligned if ``numbers`` is False.
     """
-    table = Table(title=_letters(title), box=box.SIMPLE, title_justify="left", title_style="")
+    table, lines = (
+        Table(box=box.SIMPLE, header_style=""),
+        [list(map(_letters, row)) for row in rows],
+    )
+    words = [word for line in lines for word in line[0].split()]
     for k, column in enumerate(columns):
         table.add_column(
-            _letters(column), justify="right" if numbers and k else "left", overflow="fold"
+            _letters(column),
+            justify="right" if numbers and k else "left",
+            overflow="fold",
+            min_width=max(map(len, words), default=0) if k == 0 and console.width >= 80 else None,
         )
-    for row in rows:
-        if len(row) == 1:
+    for line in lines:
+        if len(line) == 1:
             table.add_section()
-        table.add_row(*map(_letters, row))
-    Console(highlight=False, markup=False, emoji=False).print(table)
+        table.add_row(*line)
+    print_text(title)
+    console.print(table)
 
 
 class Entry(NamedTuple):
@@ -66,11 +75,12 @@ class Entry(NamedTuple):
     meaning: str
     unit: str | None = "1"
     stderr: Any = None
+    ci95: Any = None
 
 
 def print_json(entries: Mapping[str, Entry]) -> None:
     """Print the entries on standard output."""
-    keys = ("value", "stderr", "unit", "meaning")
+    keys = ("value", "stderr", "ci95", "unit", "meaning")
     plain = {
         name: {key: _plain(getattr(entry, key)) for key in keys} for name, entry in entries.items()
     }

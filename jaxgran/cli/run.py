@@ -105,7 +105,7 @@ def run_run_command(
     if recorder is not None and recorder.frames:
         _write_frames(files, recorder.frames, film, quiet)
     output = chosen.get("output")
-    finish(data, [output] if output is not None and written else [], interrupted, output)
+    finish(data, [output] if output is not None and written else [], interrupted, quiet, output)
 
 
 run_command = command(RUN_OPTIONS, run_run_command, required=("restitution", "packing_fraction"))
@@ -218,9 +218,9 @@ def _entries(data) -> dict[str, Entry]:
         )
     for name in LARGE_SYSTEM:
         path, row = f"{name}_large_system", OBSERVABLES[name]
-        total = point[f"{path}_ci95"].sel(error_source="total")
-        entries[path] = Entry(point[path].values, f"{row.meaning}, of a large system", row.unit)
-        entries[f"{path}_ci95"] = Entry(total.values, total.long_name, row.unit)
+        total = point[f"{path}_ci95"].sel(error_source="total").values
+        words = f"{row.meaning}, of a large system"
+        entries[path] = Entry(point[path].values, words, row.unit, ci95=total)
     ratio, error = shear_stress_ratio(point)
     meaning = "contact shear stress over binary shear stress"
     entries["shear_stress_ratio"] = Entry(ratio.values, meaning, "1", error.values)
@@ -246,10 +246,10 @@ def _print_averages(data, all: bool) -> None:
     )
     columns = (
         "observable",
-        "value ± standard error",
+        "value ±\nstandard error",
         "unit",
-        "effective samples",
-        "kinetic theory",
+        "effective\nsamples",
+        "kinetic\ntheory",
     )
     rows: list[list[str]] = []
     point = flattened(data).isel(packing_fraction=0, restitution=0)

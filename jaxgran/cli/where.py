@@ -83,10 +83,8 @@ def _entries(flow: Validity) -> dict[str, Entry]:
     for group, values, half_widths, meaning in groups:
         for name, value in values.items():
             unit = _UNITS[name] if group in ("", "theory/", "corrected/") else "1"
-            entries[group + name] = Entry(value, meaning + _ASSUMPTIONS.get(name, ""), unit)
-            if name in half_widths:
-                half = Entry(half_widths[name], "half-width of the 95 % interval", unit)
-                entries[f"{group}{name}_ci95"] = half
+            words = meaning + _ASSUMPTIONS.get(name, "")
+            entries[group + name] = Entry(value, words, unit, ci95=half_widths.get(name))
     grains = head["grains"]  # a number, or in words where it depends on the flow
     entries["grains"] = Entry(
         int(grains) if grains.isdecimal() else grains, "number of grains of the reference map"
