@@ -170,8 +170,9 @@ def of_large_system(flat: xr.Dataset, name: str, path: str) -> dict[str, np.ndar
     large, errors = (flat[x] for x in _columns(bounded))
     slope = errors.sel(error_source="sampling") / (HALF_INTERVAL * flat[f"{bounded}_stderr"])
     value = large if name == RATIO else flat[path] * slope
-    bounds = errors.sel(error_source=["timestep", "size", "tolerance"])
-    bound = np.sqrt((bounds**2).sum("error_source")) * value / large
+    squares = errors**2
+    others = squares.sel(error_source="total") - squares.sel(error_source="sampling")
+    bound = np.sqrt(others) * value / large
     return {
         name: value.values,
         f"{name}_stderr": (flat[f"{path}_stderr"] * slope).values,

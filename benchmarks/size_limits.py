@@ -19,10 +19,10 @@ velocity that lasts longer than a sample is not in those of the flows.
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.stats import chi2
 
@@ -30,7 +30,7 @@ import jaxgran as jg
 from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.sampling.budget import SIZE_LAWS, SizeLaw, jamming_error
+from jaxgran.sampling.budget import LARGE_SYSTEM, SIZE_LAWS, SizeLaw
 
 AVERAGES = tuple(SIZE_LAWS)
 LAWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -61,7 +61,7 @@ def run(output: Output) -> None:
         *rows_of_maps("sizes_loose", "sizes_dense"),
     ]
     (large,) = rows_of_maps("large")
-    laws, limits, tests, checks = {}, [], [], []
+    laws, limits, tests = {}, [], []
     for average in AVERAGES:
         flows = flows_of(rows, average)
         loose = [flow for flow in flows if flow.packing_fraction <= LARGEST_FRACTION]
@@ -72,18 +72,18 @@ def run(output: Output) -> None:
         tests.append(
             {"average": average, **compared_with_larger(large, flows, average, laws[average])}
         )
-        checks += list(
-            checked(average, SizeLaw(*laws[average]["law"]["constants"], SIZE_LAWS[average].spread))
-        )
         limits += [
             {"average": average, **one}
             for one in limits_of(loose, laws[average]["exponents"]["interval"])
         ]
         print(average, rounded(laws[average], 4))
-        print(rounded([tests[-1], *checks[-2:]], 4))
+        print(rounded(tests[-1], 4))
+    unfitted = list(checks())
+    for row in unfitted:
+        print(rounded(row, 4))
     output.write_rows(
         "size_limits",
-        {"laws": rounded(laws, 5), "tests": rounded(tests, 5), "checks": rounded(checks, 4)},
+        {"laws": rounded(laws, 5), "tests": rounded(tests, 5), "checks": rounded(unfitted, 4)},
         "rows",
         rounded(limits, 5),
     )
@@ -206,35 +206,35 @@ def compared_with_larger(
     }
 
 
-def checked(average: str, law: SizeLaw) -> Iterator[dict[str, Any]]:
-    """How flows that the law was not fitted to agree with those of 25,600 grains, for each smaller
-    N: root mean squares as they are, corrected, and of sampling; the share within the 95 % interval
-    of the correction, and its half-width (rms).
+def checks() -> Iterator[dict[str, Any]]:
+    """How flows that no law was fitted to agree with those of 25,600 grains, for each average and
+    smaller N: root mean squares as they are, corrected, and of sampling; the half-width (rms) of
+    the 95 % interval of the correction and of sampling, and the share of flows within.
     """
     small, large = (
         jg.open_map(RESULTS / f"reference_check_{name}.nc").to_dataset()
         for name in ("small", "large")
     )
-    flows = small.restitution, small.packing_fraction
-    values, errors = large[average], large[f"{average}_stderr"] / large[average]
-    most_missing = law.missing(*xr.broadcast(*flows), large.grains.item())
-    for grains in small.grains.values.tolist():
-        smaller = small.sel(grains=grains)
-        missing = law.missing(*xr.broadcast(*flows), grains)
-        ratio = (smaller[average] / values).transpose("restitution", ...).values
-        noise = np.hypot(smaller[f"{average}_stderr"] / smaller[average], errors)
-        noise = noise.transpose("restitution", ...).values
-        apart = np.log(ratio) - np.log1p(-missing) + np.log1p(-most_missing)
-        waves = law.spread * (missing - most_missing) / (1 - missing)
-        jamming = jamming_error(small.packing_fraction.values, grains)
-        half = np.sqrt(waves**2 + jamming**2 + (HALF_INTERVAL * noise) ** 2)
-        rms = {"as_it_is": np.log(ratio), "corrected": apart, "sampling": noise, "half_width": half}
+    for name, grains in product(LARGE_SYSTEM, small.grains.values.tolist()):
+        path, own = f"{name}_large_system", small.sel(grains=grains)
+        limit = large[path]
+        sampling = np.hypot(
+            *(x[f"{path}_ci95"].sel(error_source="sampling") / limit for x in (own, large))
+        )
+        size = own[f"{path}_ci95"].sel(error_source="size") / limit
+        apart, half = own[path] / limit - 1, np.hypot(sampling, size)
+        rms = {
+            "as_it_is": own[name] / limit - 1,
+            "corrected": apart,
+            "sampling": sampling / HALF_INTERVAL,
+            "half_width": half,
+        }
         yield {
-            "average": average,
+            "average": name,
             "grains": grains,
             "flows": apart.size,
-            **{name: float(np.sqrt(np.mean(x**2))) for name, x in rms.items()},
-            "within": float(np.mean(abs(apart) < half)),
+            **{words: float(np.sqrt((x**2).mean())) for words, x in rms.items()},
+            "within": float((abs(apart) < half).mean()),
         }
 
 

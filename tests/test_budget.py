@@ -101,7 +101,7 @@ def test_law_of_the_size_is_the_fitted_one_and_its_bound_holds(average: str) -> 
     assert found["within"] >= 0.95 - 2 * np.sqrt(0.95 * 0.05 / found["differences"])
 
 
-@pytest.mark.parametrize("average", SIZE_LAWS)
+@pytest.mark.parametrize("average", LARGE_SYSTEM)
 def test_corrected_averages_are_those_of_flows_that_no_law_was_fitted_to(average: str) -> None:
     """Sixteen flows of 25,600 grains are within the intervals as often as those of 95 % are, and
     the intervals are not much wider than what they bound.

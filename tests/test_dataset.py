@@ -12,7 +12,7 @@ from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.results import is_finished, open_map, write_dataset
-from jaxgran.maps.schema import flattened, path_of
+from jaxgran.maps.schema import ERROR_SOURCES, flattened, path_of
 from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.variables import VARIABLES
@@ -64,7 +64,7 @@ def test_every_observable_has_its_dimensions_and_errors(data) -> None:
         "restitution": 2,
         "axis_a": 2,
         "axis_b": 2,
-        "error_source": 5,
+        "error_source": len(ERROR_SOURCES),
     }
     for name, row in OBSERVABLES.items():
         path = path_of(name)

@@ -4,18 +4,24 @@ anything runs.
 
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from synthetic import refused
 
+import jaxgran as jg
 from jaxgran.cli.map import MAP_OPTIONS
 from jaxgran.contact.projected_methods import Jacobi
-from jaxgran.dynamics.batch import stack
+from jaxgran.dynamics.batch import predicted_cost, stack
+from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.automatic import (
+    PREPARED,
+    SECONDS,
     cheapest,
     chosen_settings,
+    expected_scatter,
     plans_of_sizes,
     sampling_targets,
 )
@@ -24,7 +30,9 @@ from jaxgran.maps.settings import OPTIONS, MapSettings
 from jaxgran.maps.start import with_start
 from jaxgran.model.checks import InputError
 from jaxgran.sampling.budget import size_error
+from jaxgran.sampling.timestep import COARSE_TIMESTEP
 
+RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 GOOD: dict[str, Any] = {
     "restitution": (0.5, 0.9),
     "packing_fraction": (0.6,),
@@ -171,3 +179,37 @@ def test_an_error_out_of_reach_names_the_point_and_what_helps() -> None:
     assert "more seeds or a shorter time step" in str(caught.value)
     with refused("is out of reach"):  # the time step alone takes more
         chosen(**given, timestep=1.2e-3, error=2e-3)
+
+
+def test_strain_and_time_of_a_plan_are_those_that_maps_took() -> None:
+    """Scatter and preparation of flows that the laws were not fitted to, within a factor of two on
+    average, and the processor time of their map within a factor of three.
+    """
+    data = jg.open_map(RESULTS / "reference_check_small.nc")
+    settings = MapSettings(**from_attrs(data))
+    flows = settings.flows()
+    shape = len(flows), -1
+    strains = data["sums/strain"].values.reshape(shape)
+    prepared = data["sums/equilibration_strain"].values.reshape(shape)
+    correlation = data.correlation_strain.values.ravel()
+    worst = np.max(
+        [
+            (data[f"{name}_stderr"] / data[name]).values.ravel()
+            for name in ("pressure", "shear_stress")
+        ],
+        axis=0,
+    )
+    alphas, sizes = (
+        np.array([getattr(flow, name) for flow in flows]) for name in ("restitution", "grains")
+    )
+    scatter = worst * np.sqrt(strains.sum(axis=1) / correlation)
+    ratios = scatter / expected_scatter(alphas, sizes)
+    assert 0.5 < np.exp(np.log(ratios).mean()) < 2 and np.exp(np.log(ratios).std()) < 2
+    assert 0.5 < np.median(prepared / correlation[:, None]) / PREPARED < 2
+    cost = sum(
+        (flow.grains / 1000) ** 0.2
+        * (own.sum() * predicted_cost(flow) + before.sum() * predicted_cost(flow, COARSE_TIMESTEP))
+        for flow, own, before in zip(flows, strains, prepared, strict=True)
+    )
+    spent = data.attrs["workers"] * data.attrs["wall_time_seconds"]
+    assert 1 / 3 < SECONDS * cost / spent < 3

@@ -26,12 +26,13 @@ from jaxgran.model.checks import refused
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import with_error
 
-_BUDGETED = {
+_PRINTED = {
     "force_ratio": "force ratio",
     "pressure": "pressure",
     "shear_stress": "shear stress",
     "granular_temperature": "temperature",
     "local_granular_temperature": "local temperature",
+    "macroscopic_friction": "friction",
 }
 _SOURCES = {"sampling": "sampling", "timestep": "dt", "size": "size"}  # of errors above 0.4 %
 _SMALLER = (
@@ -108,7 +109,7 @@ def _stamp(path: Path | None) -> tuple[int, int] | None:
     return None
 
 
-def _say_imprecise(data) -> None:
+def _say_errors(data) -> None:
     """Print the largest relative error beside the requested one, and the sampled strains."""
     import numpy as np
 
@@ -138,20 +139,19 @@ def print_large_system(data) -> None:
     import numpy as np
 
     from jaxgran.maps.schema import flattened, relative_ci95
-    from jaxgran.sampling.budget import MEASURED_POLYDISPERSITY
 
     shown = flattened(data)
     if not np.isfinite(shown.force_ratio).any():
         return
     point = shown.status.size == 1
     size = f"N = {data.attrs['grains']}" if "grains" in data.attrs else "its N"
-    values = (size, "large system") if point else ("change", "total")
+    values = (size, "large system") if point else ("correction", "total")
     title = "Averages of a large system, ± 95 %, and the parts of their errors"
     title += " in %" if point else " in %: median (largest)"
-    if data.attrs.get("polydispersity") != MEASURED_POLYDISPERSITY:
+    if not _are_measured(shown):
         title += f"\n{shown.pressure_large_system.attrs['comment']}"
     rows = []
-    for name in _BUDGETED:
+    for name in _PRINTED:
         errors = relative_ci95(data, name)
         at_size, large = shown[name].values, shown[f"{name}_large_system"].values
         if point:
@@ -162,9 +162,22 @@ def print_large_system(data) -> None:
             cells = [_percent(large / at_size - 1), _percent(errors["total"])]
         parts = {source: _percent(errors[source]) for source in _SOURCES}
         parts |= {"timestep": "–"} if name == "force_ratio" else {}
-        rows.append([_BUDGETED[name], *cells, *parts.values()])
+        rows.append([_PRINTED[name], *cells, *parts.values()])
     print_table(title, ("average", *values, *_SOURCES.values()), rows)
     print_text(_SMALLER)
+
+
+def _are_measured(data) -> bool:
+    """Whether the laws of a large system were measured for such flows."""
+    from jaxgran.sampling.budget import MEASURED_POLYDISPERSITY, MEASURED_RANGES
+
+    values = {"grains": data.get("point_grains", data.grains)}
+    values |= {name: data[name] for name in ("restitution", "packing_fraction")}
+    within = (
+        bool(((low <= values[name]) & (values[name] <= high)).all())
+        for name, (low, high) in MEASURED_RANGES.items()
+    )
+    return data.attrs.get("polydispersity") == MEASURED_POLYDISPERSITY and all(within)
 
 
 def _percent(part) -> str:
@@ -192,7 +205,7 @@ def finish(
 
     if not quiet:
         say_written(written)
-        _say_imprecise(data)
+        _say_errors(data)
     bad = bad_points(data)
     short = bad.pop("short_sample", [])
     if short:

@@ -48,17 +48,16 @@ def print_table(
 
     All columns but the first are right-aligned, or left-aligned if ``numbers`` is False.
     """
-    table, lines = (
-        Table(box=box.SIMPLE, header_style=""),
-        [list(map(_letters, row)) for row in rows],
-    )
-    words = [word for line in lines for word in line[0].split()]
+    console = Console(highlight=False, markup=False, emoji=False)
+    table = Table(box=box.SIMPLE, header_style="")
+    lines = [list(map(_letters, row)) for row in rows]
+    longest_word = max((len(word) for line in lines for word in line[0].split()), default=0)
     for k, column in enumerate(columns):
         table.add_column(
             _letters(column),
             justify="right" if numbers and k else "left",
             overflow="fold",
-            min_width=max(map(len, words), default=0) if k == 0 and console.width >= 80 else None,
+            min_width=longest_word if k == 0 and console.width >= 80 else None,
         )
     for line in lines:
         if len(line) == 1:

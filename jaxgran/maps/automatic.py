@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxgran.dynamics.batch import predicted_cost
 from jaxgran.maps.progress import duration
@@ -41,8 +42,8 @@ _LEAST_SAMPLING_SHARE, _SAMPLING_SHARE = 0.2, 0.5
 _WARMEST = 2.0  # temperature over the expected one
 _SAFE: dict[str, Any] = {"grains": 256, "timestep": 1e-6}  # all flows accept these for "auto"
 _SIZES = np.rint(256 * 2 ** np.arange(0, 20, 0.5)).astype(int)  # few, as each one is compiled
-_PREPARED = 3.3  # correlation strains until most flows are steady
-_SECONDS = 5e-7  # of processor time for a unit of ``predicted_cost``, at 1000 grains
+PREPARED = 3.3  # correlation strains until most flows are steady
+SECONDS = 5e-7  # of processor time for a unit of ``predicted_cost``, at 1000 grains
 
 
 class Plan(NamedTuple):
@@ -85,20 +86,28 @@ def plans_of_sizes(settings: MapSettings, error: float, sizes: np.ndarray) -> Pl
     area = np.pi / 4 * sizes / nu
     correlation = flow_correlation_strain(averages, sizes, sizes, area, 1.0)
     target = _targets(settings, error, flows, sizes)
-    # of the stresses in one correlation strain: a fit to the reference maps, within a factor of 1.5
-    scatter = 0.0245 * np.exp(0.85 * (1 - alpha)) * (sizes / 1600) ** -0.415
-    samples = np.where(target > 0, (scatter / np.maximum(target, 1e-9)) ** 2, np.inf)
+    scatter = expected_scatter(alpha, sizes)
+    enough = target > _LEAST_SAMPLING_SHARE * error / HALF_INTERVAL
+    samples = np.where(enough, (scatter / np.where(enough, target, 1)) ** 2, np.inf)
     least = 2 * np.maximum(LEAST_SAMPLE, SAMPLE_CORRELATION_STRAINS * correlation)
     sampled = np.maximum(least, samples / settings.seeds * correlation)
     longest = np.maximum(LONGEST_STRAIN, LONGEST_CORRELATION_STRAINS * correlation)
-    prepared = np.maximum(LEAST_PREPARATION, _PREPARED * correlation)
+    prepared = np.maximum(LEAST_PREPARATION, PREPARED * correlation)
     coarse = np.maximum(COARSE_TIMESTEP, np.asarray(flows.timestep))
-    strain_cost = _SECONDS * (sizes / 1000) ** 0.2 * sizes / flows.grains
+    strain_cost = SECONDS * (sizes / 1000) ** 0.2 * sizes / flows.grains
     seconds = strain_cost * (
         prepared * predicted_cost(flows, coarse)[:, None] + sampled * predicted_cost(flows)[:, None]
     )
     seconds = np.where(sampled <= longest, settings.seeds * seconds, np.inf)
     return Plan(np.broadcast_to(sizes, seconds.shape), sampled, seconds)
+
+
+def expected_scatter(restitution: ArrayLike, grains: ArrayLike) -> np.ndarray:
+    """Relative standard error of the stresses in one correlation strain: a fit to the reference
+    maps, within a factor of 1.5.
+    """
+    alpha, count = np.asarray(restitution), np.asarray(grains)
+    return 0.0245 * np.exp(0.85 * (1 - alpha)) * (count / 1600) ** -0.415
 
 
 def sampling_targets(settings: MapSettings, flows: ShearFlow) -> np.ndarray | None:
@@ -169,7 +178,7 @@ def chosen_settings(parameters: Mapping[str, Any]) -> tuple[MapSettings, str]:
             f"strains of about {_range(plan.strain)} for each seed",
             f"{_time(plan.seconds.sum())} of processor time",
         ]
-    sentence = f"{'; '.join(notes)}: for a relative error of {aim} in the stresses."
+    sentence = f"{'; '.join(notes)}: for a relative error of {aim} in force ratio and stresses."
     return MapSettings(**chosen), sentence
 
 

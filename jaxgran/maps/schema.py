@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.model.checks import InputError
+from jaxgran.sampling.budget import Estimate
 from jaxgran.sampling.observables import OBSERVABLES, TENSOR_AXES
 
 FORMAT_VERSION = 5
@@ -23,7 +24,7 @@ MapData: TypeAlias = xr.DataTree | xr.Dataset
 
 RATIO = ("force_ratio", "force_ratio_stderr")
 
-ERROR_SOURCES = ("total", "sampling", "timestep", "size", "tolerance")
+ERROR_SOURCES = Estimate._fields[1:]
 """Coordinate of ``NAME_large_system_ci95``."""
 
 FINEST: dict[str, Callable[[list], float]] = {"grains": max, "timestep": min}

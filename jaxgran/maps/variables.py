@@ -12,7 +12,7 @@ import xarray as xr
 from jaxgran.maps.point_values import PointValues
 from jaxgran.maps.schema import ERROR_SOURCES, path_of
 from jaxgran.maps.seeds import STATUS_FLAGS
-from jaxgran.sampling.budget import LARGE_SYSTEM, MEASURED_POLYDISPERSITY
+from jaxgran.sampling.budget import LARGE_SYSTEM, MEASURED_POLYDISPERSITY, MEASURED_RANGES
 from jaxgran.sampling.enskog_factors import FACTORS, LENGTHS
 from jaxgran.sampling.observables import GROUPS, OBSERVABLES, STRESS_UNIT
 
@@ -21,10 +21,12 @@ _LONG = {"grain", "quantity"}  # dimensions of many numbers
 _THEORY = "Enskog moments of an anisotropic Gaussian in each size class"
 
 
+_RANGES = ", ".join(
+    f"{name.replace('_', ' ')} {low:g} to {high:g}" for name, (low, high) in MEASURED_RANGES.items()
+)
 LAWS = (
-    "corrected for the number of grains; bounds of time step and tolerance. By laws measured at a "
-    f"polydispersity of {MEASURED_POLYDISPERSITY:g}, restitutions of 0.1 to 0.95, packing "
-    "fractions of 0.1 to 0.82 and 256 to 25,600 grains"
+    "corrected for the number of grains, with bounds of time step and tolerance, by laws measured "
+    f"at polydispersity {MEASURED_POLYDISPERSITY:g}, {_RANGES}"
 )
 """How the averages of a large system follow, and where the laws hold."""
 

@@ -2,8 +2,8 @@
 
 A standard error says how an average scatters over samples of the same length. It does not say how
 far the average is from that of a large system, of short time steps and of exact contact solves. An
-average is corrected for its number of grains, and a share of the correction is an error; the other
-two laws are bounds.
+average is corrected for its number of grains; the errors of the correction, of the time step and of
+the tolerance follow from measured laws.
 
 =========  =========================================================================================
 part       law, and what it was measured with
@@ -32,6 +32,11 @@ from jaxgran.sampling.timestep import distance_to_jamming, stress_error
 # relative error of the stress of one solve over its residual, that 98 % of solves do not exceed
 RESIDUAL_FACTOR = 34
 MEASURED_POLYDISPERSITY = 0.26  # of the flows that all laws here are measured with
+MEASURED_RANGES = {
+    "restitution": (0.1, 0.95),
+    "packing_fraction": (0.1, 0.82),
+    "grains": (256, 25_600),
+}
 _MOST_MISSING = 0.6  # with a few grains the laws do not hold
 # The excess of a force ratio has 1.2 times the error of the pressure, and so has another tenth:
 # clusters of grains are also missing where the mean force hardly exceeds that of binary collisions.
