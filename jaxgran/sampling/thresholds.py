@@ -55,8 +55,8 @@ CLUSTER_STRAIN = 1.0
 FEWEST_CORRELATION_STRAINS = 4.0  # 94 %, 81 %; a shorter one has the status ``short_sample``
 SAMPLE_CORRELATION_STRAINS = 6.0  # 95 %, 78 %; where the strain is not given
 LEAST_SAMPLE = 8.0  # strain, at least: 16 of the shortest correlation strains
-# A sample for an error: 95 %, 88 % over nine points (``python -m benchmarks coverage --error
-# 0.05``). It ends at the longer one of these limits of cost, as 2.6 % of the samples did there.
+# A sample for an error: 96 %, 90 % over nine points (``python -m benchmarks coverage --error
+# 0.05``). It ends at the longer one of these limits of cost, as 8 % of the samples did there.
 LONGEST_STRAIN = 256.0
 LONGEST_CORRELATION_STRAINS = 32.0
 
