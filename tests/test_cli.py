@@ -184,6 +184,20 @@ def test_map_prints_the_tables_and_the_progress_apart(small_map, small_data) -> 
     assert "points" not in out and "4/4 points" in err and "wrote small.nc" in err
 
 
+def test_map_prints_json_of_every_point(small_map, small_data) -> None:
+    outcome = jaxgran(small_map[0], *SMALL_MAP.split(), "--resume", "--json")
+    printed = parsed(outcome.out)
+    for name in ("force_ratio", "pressure", "status"):
+        assert np.shape(printed[name]["value"]) == (2, 2)
+    np.testing.assert_array_equal(printed["pressure"]["value"], small_data.pressure)
+    np.testing.assert_array_equal(
+        printed["pressure_large_system"]["ci95"],
+        small_data.pressure_large_system_ci95.sel(error_source="total"),
+    )
+    assert printed["timestep"]["unit"] == "1 / shear rate"
+    assert {*np.ravel(printed["status"]["value"])} <= {*Status.__members__}
+
+
 @pytest.mark.filterwarnings("always:differs from")
 def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(
     small_data, no_figures, tmp_path: Path, monkeypatch
@@ -257,8 +271,8 @@ def test_run_prints_rows_of_physics_or_json_of_every_average(small_run) -> None:
     folder, _ = small_run
     short, as_json = (jaxgran(folder, *SMALL_RUN, "--resume", *more) for more in ((), ("--json",)))
     assert (
-        "shear-stress ratio" in short.out and short.out.count("±") == 1 + 10 + 2 * 5
-    )  # the heading, a row for each, and five averages at N and of a large system
+        "shear-stress ratio" in short.out and short.out.count("±") == 2 + 10 + 2 * 6
+    )  # two headings, a row for each, and six averages at N and of a large system
     found, data = parsed(as_json.out), flattened(open_map(folder / "flow.nc")).squeeze()
     assert as_json.status == short.status and set(OBSERVABLES) < set(found)
     for name, one in OBSERVABLES.items():

@@ -132,7 +132,7 @@ def test_the_command_and_the_function_start_alike() -> None:
     the terminal.
     """
     python_only = {"observe", "grains_by_point", "progress", "record", "attributes"}
-    assert set(MAP_OPTIONS) - {"format", "quiet"} == set(OPTIONS) - python_only
+    assert set(MAP_OPTIONS) - {"format", "json", "quiet"} == set(OPTIONS) - python_only
     assert with_start({}) == PRESETS["quick"]
     assert (
         with_start({"error": 0.1}).items()

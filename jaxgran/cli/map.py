@@ -8,9 +8,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 
-from jaxgran.cli.measure import finish, print_large_system, run_map
+from jaxgran.cli.measure import entries, finish, print_large_system, run_map
 from jaxgran.cli.options import FILE, QUIET, command, of_map
-from jaxgran.cli.output import print_table
+from jaxgran.cli.output import JSON, print_json, print_table
 from jaxgran.cli.terminal import say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, refused, short_repr
@@ -36,6 +36,7 @@ PLOT_EXAMPLES = {
 MAP_OPTIONS = {
     **of_map("map"),
     "format": Option("Format of the figures.", get_args(FileFormat), default="png"),
+    "json": JSON,
     "quiet": QUIET,
 }
 PLOT_OPTIONS = {
@@ -54,7 +55,9 @@ PLOT_OPTIONS = {
 }
 
 
-def run_map_command(format: FileFormat = "png", quiet: bool = False, **given: Any) -> None:
+def run_map_command(
+    format: FileFormat = "png", json: bool = False, quiet: bool = False, **given: Any
+) -> None:
     preset = given.get("preset", "quick")
     output = given.setdefault(
         "output", Path("jaxgran_map.nc" if preset == "quick" else f"jaxgran_map_{preset}.nc")
@@ -69,7 +72,9 @@ def run_map_command(format: FileFormat = "png", quiet: bool = False, **given: An
         if interrupted
         else draw_beside(data if whole else None, output, format, overwrite, existed)
     )
-    if whole:
+    if json:
+        print_json(entries(data))
+    elif whole:
         print_tables(data)
     finish(data, [*([output] if written else []), *pictures], interrupted, quiet, output)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxgran.cli.options import with_options
-from jaxgran.cli.output import print_table, print_text
+from jaxgran.cli.output import Entry, print_table, print_text
 from jaxgran.cli.terminal import (
     BAD_STATUS,
     configured_jax,
@@ -107,6 +107,58 @@ def _stamp(path: Path | None) -> tuple[int, int] | None:
         status = os.stat(path)  # type: ignore[arg-type]
         return status.st_ino, status.st_mtime_ns
     return None
+
+
+def entries(data) -> dict[str, Entry]:
+    """The parameters of a flow or of a map, the averages, the shear-stress ratio, and what kinetic
+    theory predicts; lists are by packing fraction, then by restitution.
+    """
+    from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
+    from jaxgran.sampling.budget import LARGE_SYSTEM
+    from jaxgran.sampling.observables import OBSERVABLES
+
+    flat = flattened(data)
+    axes = ("grains", "timestep", "packing_fraction", "restitution")
+    shown = {
+        name: Entry(
+            flat[name].values,
+            flat[name].long_name,
+            flat[name].attrs.get("reduced_unit", flat[name].units),
+        )
+        for name in axes
+        if name in flat
+    }
+    names = dict(
+        zip(flat.status.flag_values.tolist(), flat.status.flag_meanings.split(), strict=True)
+    )
+    shown |= {
+        "strain": Entry(flat["sums/strain"].sum("seed").values, "sampled strain of all seeds"),
+        "engine": Entry(data.attrs["engine"], "program that advanced the flow", None),
+        "solver": Entry(data.attrs["solver"], "method of the contact solve", None),
+        "status": Entry(_named(flat.status.values.tolist(), names), "worst status", None),
+    }
+    for name, row in OBSERVABLES.items():
+        path, stderr = path_of(name), flat.get(f"{path_of(name)}_stderr")
+        errors = None if stderr is None else stderr.values
+        shown[name] = Entry(flat[path].values, row.meaning, row.unit, errors)
+        if name in LARGE_SYSTEM:
+            total = flat[f"{name}_large_system_ci95"].sel(error_source="total").values
+            large, words = flat[f"{name}_large_system"].values, f"{row.meaning}, of a large system"
+            shown[f"{name}_large_system"] = Entry(large, words, row.unit, ci95=total)
+        if f"theory/{name}" in flat:
+            words = f"{row.meaning}, by kinetic theory"
+            shown[f"theory/{name}"] = Entry(flat[f"theory/{name}"].values, words, row.unit)
+    ratio, error = (x.values for x in shear_stress_ratio(flat))
+    words = "contact shear stress over binary shear stress"
+    shown["shear_stress_ratio"] = Entry(ratio, words, "1", error)
+    return shown
+
+
+def _named(values: Any, names: Mapping[int, str]) -> Any:
+    """The names of statuses, in the form of their numbers."""
+    if isinstance(values, list):
+        return [_named(value, names) for value in values]
+    return names[values]
 
 
 def _say_errors(data) -> None:

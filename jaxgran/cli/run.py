@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxgran.cli.measure import finish, print_large_system, run_map
+from jaxgran.cli.measure import entries, finish, print_large_system, run_map
 from jaxgran.cli.options import QUIET, command, of_map
-from jaxgran.cli.output import JSON, Entry, print_json, print_table
+from jaxgran.cli.output import JSON, print_json, print_table
 from jaxgran.cli.terminal import configured_jax, counted, say
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, require_number, short_repr
@@ -98,7 +98,7 @@ def run_run_command(
     plane = {"restitution": (restitution,), "packing_fraction": (packing_fraction,)}
     data, interrupted, written = run_map({**plane, **chosen, "record": record}, quiet)
     if json:
-        print_json(_entries(data))
+        print_json(entries(data.isel(packing_fraction=0, restitution=0)))
     elif bool(data.force_ratio.notnull().any()):
         _print_averages(data, all)
         print_large_system(data)
@@ -184,51 +184,6 @@ def _write_frames(files: FrameFiles, frames: int, film, quiet: bool) -> None:
         follow = iter if quiet else partial(counted, words="frames")
         write_movie(files.movie, film, follow=follow)
         say(f"wrote {files.movie}: {len(film)} frames")
-
-
-def _entries(data) -> dict[str, Entry]:
-    """The parameters of one flow, its averages, its shear-stress ratio, and what kinetic theory
-    predicts.
-    """
-    from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
-    from jaxgran.maps.status_report import bad_points
-    from jaxgran.sampling.budget import LARGE_SYSTEM
-    from jaxgran.sampling.observables import OBSERVABLES
-
-    point = flattened(data).isel(packing_fraction=0, restitution=0)
-    entries = {
-        name: Entry(point[name].values, point[name].long_name)
-        for name in ("restitution", "packing_fraction")
-    }
-    entries |= {
-        "grains": Entry(data.attrs["grains"], "number of grains"),
-        "timestep": Entry(data.attrs["timestep"], "time step", "1 / shear rate"),
-        "strain": Entry(point["sums/strain"].sum().values, "sampled strain of all seeds"),
-        "engine": Entry(data.attrs["engine"], "program that advanced the flow", None),
-        "solver": Entry(data.attrs["solver"], "method of the contact solve", None),
-        "status": Entry(next(iter(bad_points(data)), "ok"), "worst status", None),
-    }
-    for name, one in OBSERVABLES.items():
-        path = path_of(name)
-        entries[name] = Entry(
-            point[path].values,
-            one.meaning,
-            one.unit,
-            point[f"{path}_stderr"].values if f"{path}_stderr" in point else None,
-        )
-    for name in LARGE_SYSTEM:
-        path, row = f"{name}_large_system", OBSERVABLES[name]
-        total = point[f"{path}_ci95"].sel(error_source="total").values
-        words = f"{row.meaning}, of a large system"
-        entries[path] = Entry(point[path].values, words, row.unit, ci95=total)
-    ratio, error = shear_stress_ratio(point)
-    meaning = "contact shear stress over binary shear stress"
-    entries["shear_stress_ratio"] = Entry(ratio.values, meaning, "1", error.values)
-    for name, one in OBSERVABLES.items():
-        if f"theory/{name}" in point:
-            meaning = f"{one.meaning}, by kinetic theory"
-            entries[f"theory/{name}"] = Entry(point[f"theory/{name}"].values, meaning, one.unit)
-    return entries
 
 
 def _print_averages(data, all: bool) -> None:
