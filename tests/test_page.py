@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from command_line import jaxgran
 from made_up_maps import ratio_dataset, with_grains
 from pages import MARKUP, page_map
@@ -17,6 +18,7 @@ from synthetic import one_sentence, random_instant
 
 import jaxgran as jg
 from jaxgran.maps.schema import flattened, path_of
+from jaxgran.model.display import with_error
 from jaxgran.page.document import Page
 from jaxgran.page.grain_data import grain_data, scale_of
 from jaxgran.page.map_data import MOST_POINTS, map_data
@@ -40,6 +42,17 @@ def assert_same_numbers(shown: list, expected: np.ndarray) -> None:
     """To six digits; None where there is no number."""
     numbers = np.array([math.nan if x is None else x for x in shown])
     np.testing.assert_allclose(numbers, np.ravel(expected), rtol=5e-7, atol=0)
+
+
+def texts(values: xr.DataArray, errors: xr.DataArray | None, dims: tuple[str, ...]) -> list[str]:
+    """What the command line prints of each point."""
+    numbers = [np.ravel(x.transpose(*dims)) for x in (values, errors) if x is not None]
+    return [
+        (with_error(*map(float, some)) if len(some) == 2 else f"{some[0]:.6g}")
+        if np.isfinite(some[0])
+        else "–"
+        for some in zip(*numbers, strict=True)
+    ]
 
 
 def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
@@ -68,13 +81,14 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
             )
         assert ("theory" in one) == (f"theory/{name}" in data)
         large = f"{name}_large_system"
-        assert ("whole" in one) == ("large" in one) == (large in data)
+        assert ("large" in one) == (large in data)
         if "theory" in one:
             assert_same_numbers(one["theory"], data[f"theory/{name}"].values)
-        if "whole" in one:
-            assert_same_numbers(one["large"], data[large].values)
+        values, errors = data[path_of(name)], data.get(f"{path_of(name)}_stderr")
+        if "large" in one:
             half_width = data[f"{large}_ci95"].sel(error_source="total")
-            assert_same_numbers(one["whole"], half_width.values)
+            assert one["large"] == texts(data[large], half_width, dims)
+        assert one["text"] == texts(values, errors, dims)
         if not observable.extreme:
             correlated = data["diagnostics/correlation_strain"].sel(observable=name)
             assert_same_numbers(one["samples"], (strain / correlated).values)

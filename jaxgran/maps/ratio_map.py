@@ -230,6 +230,10 @@ def _require_own_attributes(run: RunOptions, settings: MapSettings) -> None:
         return
     for name in names & {*OPTIONS, *run_attributes(settings), *_OF_RUN}:
         raise refused("attributes", name, "must have names that a map does not have")
+    for name in names:
+        value = (run.attributes or {})[name]
+        if not isinstance(value, str | int | float):
+            raise refused("attributes", value, "must be texts or numbers")
 
 
 def _workers(run: RunOptions) -> int:

@@ -47,7 +47,7 @@ function hoverText(one, row, column) {
   const point = pointAt(row, column);
   const lines = [
     `α = ${plain(restitutions[column])}, ν = ${plain(fractions[row])}`,
-    `${one.name.replace(/_/g, " ")} = ${withError(one.value[point], one.error?.[point]).filter(Boolean).join(" ± ")} ${one.unit}`,
+    `${one.name.replace(/_/g, " ")} = ${one.text[point]} ${one.unit}`,
   ];
   if (one.theory) lines.push(`kinetic theory ${numberText(one.theory[point])}`);
   if (sizes.length) lines.push(`N = ${grainsAt(point)}${timesteps.length ? `, dt = ${timestepAt(point)}/γ̇` : ""}`);

@@ -12,7 +12,7 @@ import xarray as xr
 from jaxgran.maps.schema import FINEST, TENSOR_AXES, MapData, path_of, require_map
 from jaxgran.maps.settings import DEFAULTS, options
 from jaxgran.model.checks import InputError
-from jaxgran.model.display import unit_text
+from jaxgran.model.display import unit_text, with_error
 from jaxgran.model.status import MEANINGS
 from jaxgran.page.grain_data import ENCODING, MOST_GRAINS, grain_data, scale_of
 from jaxgran.page.reference_map import verdicts
@@ -49,9 +49,9 @@ def map_data(data: MapData) -> dict[str, Any]:
     =============  =================================================================================
     axes           the dimensions, outermost first: name, label and values; numbers of grains and
                    time steps have one value if the map has one, and none if it is not known
-    observables    name, meaning and unit; values; and where the map has them standard errors,
-                   predictions of kinetic theory, numbers of effective samples, and values and
-                   half-widths of 95 % intervals of a large system
+    observables    name, meaning and unit; values, and texts of these with their errors; and where
+                   the map has them standard errors, predictions of kinetic theory, numbers of
+                   effective samples, and texts of averages of a large system with 95 % intervals
     status         the status of each point; meanings of the statuses
     grains         the number of grains of each point, if it was chosen by point
     instants       grains and forces of each point, see ``grain_data``
@@ -178,8 +178,22 @@ def _observables(
             "meaning": _text(about.get("long_name", label.replace("_", " ")))
             + component.replace("_", ", "),
             "unit": unit_text(_text(about.get("reduced_unit", about.get("units", "")))),
-            **{part: numbers(values) for part, values in columns.items()},
+            **{part: numbers(values) for part, values in columns.items() if part != "whole"},
+            "text": _texts(columns["value"], columns.get("error")),
+            **(
+                {"large": _texts(columns["large"], columns.get("whole"))}
+                if "large" in columns
+                else {}
+            ),
         }
+
+
+def _texts(values: np.ndarray, errors: np.ndarray | None) -> list[str]:
+    """Values with errors as the command line prints them."""
+    if errors is None:
+        return [f"{value:.6g}" if np.isfinite(value) else "–" for value in values.tolist()]
+    pairs = zip(values.tolist(), errors.tolist(), strict=True)
+    return [with_error(*pair) if np.isfinite(pair[0]) else "–" for pair in pairs]
 
 
 def _effective_samples(data: xr.Dataset, observable: str) -> xr.DataArray | None:

@@ -25,17 +25,6 @@ function numberText(value, digits = 6) {
   return value === null || value === undefined ? "–" : plain(Number(value.toPrecision(digits)));
 }
 
-// A value and its error as texts: two digits of the error, and the value to the same place.
-function withError(value, error) {
-  if (!Number.isFinite(value) || !(error > 0)) return [numberText(value), error === undefined ? "" : numberText(error, 2)];
-  const scale = Math.abs(value) < 1e-3 && error < 1e-3 ? 10 ** Math.floor(Math.log10(Math.max(Math.abs(value), error))) : 1;
-  const digits = 1 - Math.floor(Math.log10(Number((error / scale).toPrecision(2))));
-  const unit = 10 ** Math.max(-digits, 0);
-  const text = (x) => (Math.round(x / scale / unit) * unit || 0).toFixed(0);
-  const rounded = (x) => (digits > 0 ? (x / scale).toFixed(digits) : text(x)) + (scale < 1 ? `e${Math.round(Math.log10(scale))}` : "");
-  return [rounded(value), rounded(error)];
-}
-
 function withUnit(text, unit) {
   return unit ? `${text} (${unit})` : text;
 }

@@ -1,12 +1,12 @@
 // The numbers of the chosen point as a table, and as text to copy.
 "use strict";
 
-const COLUMNS = ["observable", "value", "± error", "unit", "theory", "samples", "large system", "± 95 %"];
+const COLUMNS = ["observable", "value ± error", "unit", "theory", "samples", "large system ± 95 %"];
 
 function tableRows(observables, point) {
   return observables.map((one) => {
     const at = (part, digits) => (one[part] ? numberText(one[part][point], digits) : "");
-    return [one.name.replace(/_/g, " "), ...withError(one.value[point], one.error?.[point]), one.unit, at("theory"), at("samples", 3), ...(one.large ? withError(one.large[point], one.whole?.[point]) : ["", ""])];
+    return [one.name.replace(/_/g, " "), one.text[point], one.unit, at("theory"), at("samples", 3), one.large?.[point] ?? ""];
   });
 }
 
