@@ -357,6 +357,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
         "observe", lambda seen: seen.state.side
     ),
     "names that a map does not have, not 'seeds'": lambda: make_map("attributes", {"seeds": 7}),
+    "attributes must be texts or numbers": lambda: make_map("attributes", {"label": None}),
     "workers must be": lambda: make_map("workers", 0),
     "output must be": lambda: make_map("output", "map.txt"),
     "resume": lambda: make_map("resume", True),
