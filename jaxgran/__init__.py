@@ -1,13 +1,6 @@
-"""jaxgran: flows of rigid, frictionless discs in simple shear by contact dynamics, in JAX.
+"""Flows of rigid, frictionless discs in simple shear by contact dynamics, in JAX.
 
-    import jaxgran as jg
-    flow = jg.ShearFlow(grains=256, restitution=0.5, packing_fraction=0.76, timestep=1e-4)
-    state = jg.prepare(flow, jax.random.key(0))  # packed, heated and sheared to the steady state
-    state, sample = jg.sample(flow, state, strain=5.0)
-    sample.force_ratio, sample.errors()["force_ratio"]
-
-Many flows are one batch: numbers and states get a leading ``(replicas,)`` axis. A grid of α and ν,
-as in the README:
+A grid of restitutions α and packing fractions ν as one batch:
 
     import jax
     import jax.numpy as jnp
@@ -23,18 +16,25 @@ as in the README:
     for row in zip(alphas, nus, samples.force_ratio, samples.errors()["force_ratio"]):
         print("α = {:.1f}, ν = {:.1f}: {:.3f} ± {:.3f}".format(*row))
 
-``sample``, ``advance`` and ``snapshot_series`` take a batch directly, also by ``jax.vmap`` and
-``jax.lax.map``; ``prepare`` and ``heated`` take a batch of keys. Leave ``engine`` out: on a
-processor the numba engine is then chosen, also under ``vmap``, and nothing is faster there.
+================  ==================================================================================
+flow              ShearFlow, State, Grains, own_grains, polydisperse, Status, InputError
+run               prepare (or pack and heated), sample, Sample, advance, count_events, Tally, and
+                  the engines Jax and Numba
+frames            snapshot_series, Snapshot, write_trajectory, read_trajectory, fields_at, grid,
+                  fit_trajectory, jax_md_space
+map               ratio_map, open_map, merge_maps, explore
+answer            validity, constitutive_law
+figures           save_figures: ratio_curves, ratio_contours, theory_errors, enskog_factors,
+                  cluster_shares, averages_against_grains, ratio_against_timestep; flow_figure
+contact problems  solve_contacts, ContactNetwork, DelassusProblem, ProjectedMethod,
+                  BarzilaiBorwein, Nesterov, Jacobi
+setting up        use_cache
+================  ==================================================================================
 
-Axes: arrays of grains are ``(grains, 2)`` or ``(grains,)``, of near pairs ``(pairs,)``, of contacts
-``(contacts,)``.
-
-Units: mean grain diameter σ, mass m of a grain of that diameter, and the time unit t of the shear
-rate (t = 1/γ̇ at the default γ̇ = 1).
-
-Importing this package is quick. Only ``jg.use_cache()`` changes flags of JAX, so that later
-processes need not compile. Names are loaded when they are first used.
+Units: mean grain diameter σ, mass m of a grain of that diameter, and t = 1/γ̇. Numbers of a batch
+have a leading ``(replicas,)`` axis, arrays of grains are ``(grains, 2)`` or ``(grains,)``. Without
+``engine`` the fastest one is chosen. Only ``use_cache`` changes flags of JAX. Names are loaded when
+they are first used.
 """
 
 import lazy_loader

@@ -15,6 +15,12 @@ def run_python(code: str) -> str:
     ).stdout
 
 
+def test_help_names_every_public_name_by_theme_on_one_screen() -> None:
+    text = jaxgran.__doc__ or ""
+    assert set(jaxgran.__all__) <= {*re.findall(r"\w+", text)}
+    assert len(text.splitlines()) <= 50 and max(map(len, text.splitlines())) <= 100
+
+
 def test_import_is_light() -> None:
     heavy = ("jax", "jax_md", "xarray", "matplotlib", "typer", "numpy")
     assert (
