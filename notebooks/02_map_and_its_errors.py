@@ -100,8 +100,8 @@ xr.Dataset(
 # %% [markdown]
 # ## Beside the reference map
 #
-# `jg.validity` reads a map of N = 1000 and dt = 1e-5 that was measured once. Its pressure should
-# agree with that above within the combined intervals, although N and dt differ. Its force ratio
+# `jg.validity` reads a map of up to 6400 grains, dt = 1e-4, that was measured once, for a large
+# system. Its pressure should agree with that above within the combined intervals. Its force ratio
 # need not, since it belongs to another dt.
 
 # %%
@@ -141,7 +141,7 @@ plt.show()
 # ## Does kinetic theory hold where collisions are binary?
 #
 # Not necessarily. A force ratio near one says that clusters carry little, not that velocities are
-# independent. The best theory of this package, moments of an anisotropic Gaussian with Enskog's
+# independent. The best of three theories, moments of an anisotropic Gaussian with Enskog's
 # collision rate, against the reference map:
 
 # %%
@@ -156,7 +156,7 @@ off, interval, ratio = (
 )
 near = ratio < 1.05
 print(
-    f"{near.sum()} of {near.size} points have a force ratio below 1.05 (N = 1000, dt = 1e-5); at",
+    f"{near.sum()} of {near.size} points have a force ratio below 1.05 (dt = 1e-4); at",
     end=" ",
 )
 print(f"{(near & (abs(off) < 0.1)).sum()} of these the theory's pressure is within 10 %")
