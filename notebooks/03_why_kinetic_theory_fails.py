@@ -172,8 +172,8 @@ axes.legend(title=r"restitution $\alpha$", title_fontsize=7, fontsize=7, frameon
 plt.show()
 
 # %% [markdown]
-# Lines: the law of L′ in α and ν that was fitted to the reference map (N = 6400 or 1600, dt = 1e-4).
-# Bars: one standard error.
+# Lines: the law of L′ in α and ν that was fitted to the reference map (dt = 1e-4). Bars: one
+# standard error.
 #
 # ## The theory, mended
 #

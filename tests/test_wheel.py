@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from jaxgran.maps.results import open_map
-from jaxgran.model.display import with_error
+from jaxgran.model.display import in_brackets
 
 pytestmark = [
     pytest.mark.environment,
@@ -133,10 +133,10 @@ def test_a_user_without_rights_home_and_cache_gets_a_table(place: Path, anyone, 
     assert max(map(len, out.splitlines())) <= 80
     data = open_map(folder / "jaxgran_map.nc")
     rows = [line for line in out.splitlines() if line.startswith("| 0.7 ")]
-    assert rows and all("+-" in row for row in rows)
+    assert rows and all("(" in row for row in rows)
     there = data.sel(packing_fraction=0.7)
     for numbers in zip(there.force_ratio.values, there.force_ratio_stderr.values, strict=True):
-        assert any(with_error(*numbers).replace("±", "+-") in row for row in rows)
+        assert any(in_brackets(*numbers) in row for row in rows)
     assert {path.suffix for path in folder.iterdir()} >= {".nc", ".png"} and not list(
         shared.iterdir()
     )

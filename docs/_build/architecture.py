@@ -30,7 +30,7 @@ _LINE, _NUMBER = "0.35", 7.0
 def rows() -> list[list[str]]:
     """The rows of folders, the highest first, as the contract of the imports names them."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    (contract,) = settings["tool"]["importlinter"]["contracts"]
+    contract = next(x for x in settings["tool"]["importlinter"]["contracts"] if "layers" in x)
     return [[name.strip() for name in layer.split("|")] for layer in contract["layers"]]
 
 

@@ -15,7 +15,7 @@ from jaxgran.cli.terminal import say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.choices import FileFormat
-from jaxgran.model.display import with_error
+from jaxgran.model.display import in_brackets
 
 MAP_EXAMPLES = {
     "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two "
@@ -154,20 +154,22 @@ plot_command = command(PLOT_OPTIONS, run_plot_command, argument=FILE)
 
 
 def _print_ratio(data) -> None:
-    """The force ratio of a map with standard errors; * marks a bad status."""
+    """The force ratio of a map with standard errors in brackets; * marks a bad status."""
     rule = data.attrs["activation"]
     size = f"{data.attrs['grains']} grains, " if "grains" in data.coords else ""
     title = (
-        f"Force ratio at {size}dt = {data.attrs['timestep']:g} / shear rate, {rule} activation; a "
-        "column is a restitution, * marks a bad status"
+        f"Force ratio by packing fraction ν and restitution α: {size}dt = "
+        f"{data.attrs['timestep']:g} / shear rate, {rule} activation. In brackets: standard error "
+        "of the last digits. *: bad status."
     )
     rows = []
     for nu in data.packing_fraction.values:
         line = data.sel(packing_fraction=nu)
         numbers = line.force_ratio.values, line.force_ratio_stderr.values, line.status.values
         cells = [
-            (with_error(value, error) if math.isfinite(value) else "no value") + " *" * bool(status)
+            (in_brackets(value, error) if math.isfinite(value) else "no value")
+            + " *" * bool(status)
             for value, error, status in zip(*numbers, strict=True)
         ]
         rows.append([f"{nu:g}", *cells])
-    print_table(title, ["packing fraction", *(f"{x:g}" for x in data.restitution.values)], rows)
+    print_table(title, ["ν", *(f"α = {x:g}" for x in data.restitution.values)], rows)

@@ -66,6 +66,19 @@ def with_error(value: float, error: float) -> str:
     return f"({text})e{shared:+03d}" if shared else text
 
 
+def in_brackets(value: float, error: float) -> str:
+    """A value with its standard error in units of the last digits.
+
+    Examples:
+      >>> in_brackets(1.2093, 0.0101), in_brackets(6.77, 0.23), in_brackets(58.7, 6.04)
+      ('1.209(10)', '6.77(23)', '59(6)')
+    """
+    text = with_error(value, error)
+    mean, _, half = text.partition(" ± ")
+    digits = half if half[:1] not in ("0", "") else half.replace(".", "").lstrip("0")
+    return text if "e" in text or not digits else f"{mean}({digits})"
+
+
 def unit_text(unit: str) -> str:
     """A unit of the tables with its signs, such as ``mσ²/t²`` for ``m sigma^2 / t^2``; nothing for
     a pure number.
