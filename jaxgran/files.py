@@ -97,22 +97,17 @@ def is_locked(path: Path, handle: int | None) -> bool:
         return False
 
 
-def with_checksum(content: bytes) -> bytes:
-    """The content, followed by its SHA-256 checksum."""
-    return content + hashlib.sha256(content).digest()
-
-
-def without_checksum(content: bytes) -> bytes | None:
-    """The content before its checksum; None if that is not its own."""
-    whole = content[:-_DIGEST]
-    return whole if with_checksum(whole) == content else None
-
-
 def read_cached(path: Path) -> bytes | None:
     """The content of a cache file; None if it is missing or damaged."""
     with suppress(OSError):
-        return without_checksum(path.read_bytes())
+        stored = path.read_bytes()
+        content = stored[:-_DIGEST]
+        return content if _with_checksum(content) == stored else None
     return None
+
+
+def _with_checksum(content: bytes) -> bytes:
+    return content + hashlib.sha256(content).digest()
 
 
 def other_version(name: str, stored: object, version: int | str) -> str:
@@ -133,7 +128,7 @@ def write_cached(path: Path, content: bytes, most: int) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
-        temporary.write_bytes(with_checksum(content))
+        temporary.write_bytes(_with_checksum(content))
     with suppress(OSError):
         newest_first = sorted(
             path.parent.glob(f"*{path.suffix}"), key=lambda x: x.stat().st_mtime, reverse=True

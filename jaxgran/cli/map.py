@@ -8,6 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
+
 from jaxgran.cli.measure import entries, finish, print_large_system, run_map
 from jaxgran.cli.options import FILE, QUIET, command, of_map
 from jaxgran.cli.output import JSON, print_json, print_table
@@ -119,8 +121,6 @@ def print_tables(data) -> None:
     """Print the force ratio of every part of a map that has one, and the averages of a large
     system.
     """
-    import numpy as np
-
     from jaxgran.maps.schema import parts
 
     for part in parts(data):

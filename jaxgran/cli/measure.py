@@ -9,6 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from jaxgran.cli.options import with_options
 from jaxgran.cli.output import Entry, print_table, print_text
 from jaxgran.cli.terminal import (
@@ -113,7 +115,7 @@ def entries(data) -> dict[str, Entry]:
     """The parameters of a flow or of a map, the averages, the shear-stress ratio, and what kinetic
     theory predicts; lists are by packing fraction, then by restitution.
     """
-    from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
+    from jaxgran.maps.schema import flag_names, flattened, path_of, shear_stress_ratio
     from jaxgran.sampling.budget import LARGE_SYSTEM
     from jaxgran.sampling.observables import OBSERVABLES
 
@@ -128,14 +130,12 @@ def entries(data) -> dict[str, Entry]:
         for name in axes
         if name in flat
     }
-    names = dict(
-        zip(flat.status.flag_values.tolist(), flat.status.flag_meanings.split(), strict=True)
-    )
+    statuses = np.vectorize(flag_names(flat.status).get)(flat.status.values)
     shown |= {
         "strain": Entry(flat["sums/strain"].sum("seed").values, "sampled strain of all seeds"),
         "engine": Entry(data.attrs["engine"], "program that advanced the flow", None),
         "solver": Entry(data.attrs["solver"], "method of the contact solve", None),
-        "status": Entry(_named(flat.status.values.tolist(), names), "worst status", None),
+        "status": Entry(statuses, "worst status", None),
     }
     for name, row in OBSERVABLES.items():
         path, stderr = path_of(name), flat.get(f"{path_of(name)}_stderr")
@@ -154,17 +154,8 @@ def entries(data) -> dict[str, Entry]:
     return shown
 
 
-def _named(values: Any, names: Mapping[int, str]) -> Any:
-    """The names of statuses, in the form of their numbers."""
-    if isinstance(values, list):
-        return [_named(value, names) for value in values]
-    return names[values]
-
-
 def _say_errors(data) -> None:
     """Print the largest relative error beside the requested one, and the sampled strains."""
-    import numpy as np
-
     from jaxgran.maps.schema import relative_ci95
     from jaxgran.sampling.sample import ERROR_OBSERVABLES
 
@@ -188,8 +179,6 @@ def print_large_system(data) -> None:
 
     For one point these are values; for a map, the median (largest) change and errors.
     """
-    import numpy as np
-
     from jaxgran.maps.schema import flattened, relative_ci95
 
     shown = flattened(data)
@@ -208,7 +197,7 @@ def print_large_system(data) -> None:
         at_size, large = shown[name].values, shown[f"{name}_large_system"].values
         if point:
             half = HALF_INTERVAL * shown[f"{name}_stderr"].item()
-            whole = errors["total"].item() * abs(large.item())
+            whole = shown[f"{name}_large_system_ci95"].sel(error_source="total").item()
             cells = [with_error(at_size.item(), half), with_error(large.item(), whole)]
         else:
             cells = [_percent(large / at_size - 1), _percent(errors["total"])]
@@ -236,8 +225,6 @@ def _percent(part) -> str:
     """The median of a part of the error over the points, and the largest one if there are
     several.
     """
-    import numpy as np
-
     known = part[np.isfinite(part)]
     if known.size == 0:
         return ""

@@ -9,7 +9,6 @@ from jaxgran.cli.options import OVERWRITE, command
 from jaxgran.cli.terminal import configured_jax, require_device
 from jaxgran.maps.options import Option
 from jaxgran.maps.settings import OPTIONS
-from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.choices import FileFormat
 
 MERGE_EXAMPLES = {
@@ -29,19 +28,14 @@ def run_merge_command(
 ) -> None:
     configured_jax()
     require_device()
-    from jaxgran.io.paths import require_place
+    from jaxgran.io.paths import require_absent, require_place
     from jaxgran.maps.merge import merge_maps
     from jaxgran.maps.results import write_dataset
 
     require_place(output, "output", ".nc")
     existed = os.path.exists(output)
-    if existed and not overwrite:
-        raise InputError(
-            f"output {short_repr(str(output))} already exists; pass `overwrite=True` to "
-            "replace it.",
-            field="output",
-        )
     if not overwrite:
+        require_absent(output, "output")
         require_new_figures(output, format)
     data = merge_maps(files)
     data.attrs["command"] = command_line()

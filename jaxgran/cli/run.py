@@ -1,7 +1,6 @@
 """The command ``run``: one flow, its averages, and its frames as a trajectory or movie."""
 
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -12,8 +11,9 @@ from jaxgran.cli.measure import entries, finish, print_large_system, run_map
 from jaxgran.cli.options import QUIET, command, of_map
 from jaxgran.cli.output import JSON, print_json, print_table
 from jaxgran.cli.terminal import configured_jax, counted, say
+from jaxgran.io.paths import require_absent
 from jaxgran.maps.options import Option
-from jaxgran.model.checks import InputError, require_number, short_repr
+from jaxgran.model.checks import InputError, require_number
 from jaxgran.model.display import unit_text, with_error
 
 MOST_RECORDED = 100_000  # frames of a trajectory
@@ -122,12 +122,8 @@ def _settled(files: FrameFiles, given: Mapping[str, Any]) -> dict[str, Any]:
     if any(named.values()) and "error" not in chosen:
         chosen.setdefault("strain", _RECORDED_STRAIN)
     for name, file in named.items():
-        if file is not None and os.path.isfile(file) and not chosen.get("overwrite"):
-            raise InputError(
-                f"{name} {short_repr(str(file))} already exists; pass `overwrite=True` to replace "
-                "it.",
-                field=name,
-            )
+        if file is not None and not chosen.get("overwrite"):
+            require_absent(file, name)
     return chosen
 
 

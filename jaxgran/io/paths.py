@@ -1,4 +1,4 @@
-"""A check of the path of a file before the work that is to be written there."""
+"""Checks of the path of a file before the work that is to be written there."""
 
 import os
 import tempfile
@@ -34,3 +34,13 @@ def require_place(path: Path, option: str, ending: str) -> None:
             f"{error.strerror}.",
             field=option,
         ) from None
+
+
+def require_absent(path: Path, option: str) -> None:
+    """Raise an InputError if there is a file that would be replaced."""
+    if os.path.isfile(path):
+        raise InputError(
+            f"{option} {short_repr(str(path))} already exists; pass `overwrite=True` to replace "
+            "it.",
+            field=option,
+        )

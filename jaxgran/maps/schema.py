@@ -139,6 +139,12 @@ def parts(data: MapData) -> list[xr.Dataset]:
     return selected
 
 
+def flag_names(flags: xr.DataArray) -> dict[int, str]:
+    """The names of the values of a flag variable, such as ``status``."""
+    values = np.atleast_1d(flags.attrs["flag_values"]).tolist()
+    return dict(zip(values, flags.attrs["flag_meanings"].split(), strict=True))
+
+
 def relative_ci95(data: MapData, name: str) -> dict[str, np.ndarray]:
     """Half-width of the 95 % interval of an average of a large system over the average, at every
     point, by the source of the error.

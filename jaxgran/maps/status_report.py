@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from jaxgran.maps.schema import MapData, flattened, parts
+from jaxgran.maps.schema import MapData, flag_names, flattened, parts
 from jaxgran.model.status import MEANINGS
 from jaxgran.sampling.thresholds import FEWEST_CORRELATION_STRAINS
 
@@ -19,13 +19,7 @@ class BadPoints(UserWarning):
 
 def bad_points(data: MapData) -> dict[str, list[str]]:
     """Descriptions of the points whose status is not ok, by the name of the status."""
-    names = dict(
-        zip(
-            data.status.attrs["flag_values"].tolist(),
-            data.status.attrs["flag_meanings"].split(),
-            strict=True,
-        )
-    )
+    names = flag_names(data.status)
     bad: dict[str, list[str]] = {}
     if "part_points" in data.attrs:  # the other points are those of other parts
         in_part = np.isin(np.arange(data.status.size), data.attrs["part_points"]).reshape(

@@ -11,7 +11,7 @@ from jaxgran.dynamics.tally import flat_tally, tally_from_flat
 from jaxgran.maps.own_observables import sums_by_name
 from jaxgran.maps.points import PointGrid
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.schema import flattened
+from jaxgran.maps.schema import flag_names, flattened
 from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.states import states_of
@@ -54,10 +54,8 @@ def replicas_of(data: xr.DataTree, settings: MapSettings) -> dict[Key, Replica |
         numbers[name].values.reshape(shape)
         for name in ("sums/status", "sums/equilibration_strain", "sums/area")
     )
-    flags = numbers[
-        "sums/status"
-    ].attrs  # those of the file, which an earlier version may have written
-    for value, name in zip(flags["flag_values"], flags["flag_meanings"].split(), strict=True):
+    # the flags are those of the file, which an earlier version may have written
+    for value, name in flag_names(numbers["sums/status"]).items():
         code = Status[name] if name in Status.__members__ else NOT_RUN
         status = np.where(numbers["sums/status"].values.reshape(shape) == value, code, status)
     sums = numbers["sums/tally"].values

@@ -162,8 +162,8 @@ def _observables(
     """The entry of a variable, or those of its components."""
     about = data[name].attrs
     parts = {"value": name, "error": f"{name}_stderr"}
-    parts |= {"large": f"{name}_large_system", "whole": f"{name}_large_system_ci95"}
     parts |= {"theory": f"theory/{label}"} if path_of(label) == name else {}
+    large = f"{name}_large_system"
     samples = _effective_samples(data, label)
     for component, chosen in _components(data[name]).items():
         columns = {
@@ -173,18 +173,19 @@ def _observables(
         }
         if samples is not None:
             columns["samples"] = _column(samples, data, dims)
+        texts = {"text": _texts(columns["value"], columns.get("error"))}
+        if large in data:
+            pair = (
+                _column(data[there].isel(chosen), data, dims) for there in (large, f"{large}_ci95")
+            )
+            texts["large"] = _texts(*pair)
         yield {
             "name": _text(label + component),
             "meaning": _text(about.get("long_name", label.replace("_", " ")))
             + component.replace("_", ", "),
             "unit": unit_text(_text(about.get("reduced_unit", about.get("units", "")))),
-            **{part: numbers(values) for part, values in columns.items() if part != "whole"},
-            "text": _texts(columns["value"], columns.get("error")),
-            **(
-                {"large": _texts(columns["large"], columns.get("whole"))}
-                if "large" in columns
-                else {}
-            ),
+            **{part: numbers(values) for part, values in columns.items()},
+            **texts,
         }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxgran.maps.schema import FINEST, RATIO, MapData, finest, require_map
+from jaxgran.maps.schema import FINEST, RATIO, MapData, finest, flag_names, require_map
 from jaxgran.model.checks import InputError
 from jaxgran.plotting.style import add_caption, scientific
 
@@ -59,10 +59,7 @@ def _status_names(data: xr.Dataset) -> np.ndarray:
     """Return the name of the status of every point, in the shape of the map."""
     if "status" not in data:
         return np.full(data.force_ratio.shape, "ok", dtype=object)
-    attrs = data.status.attrs
-    values = np.atleast_1d(attrs["flag_values"]).tolist()
-    names = dict(zip(values, attrs["flag_meanings"].split(), strict=True))
-    codes = data.status.values
+    names, codes = flag_names(data.status), data.status.values
     return np.array([names.get(code, f"status {code}") for code in codes.flat], object).reshape(
         codes.shape
     )
