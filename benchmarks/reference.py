@@ -168,7 +168,10 @@ def of_large_system(flat: xr.Dataset, name: str, path: str) -> dict[str, np.ndar
     """An average of a large system, its standard error, and the bound of all other errors."""
     bounded = BOUNDED_BY.get(name, name)
     large, errors = (flat[x] for x in _columns(bounded))
-    slope = errors.sel(error_source="sampling") / (HALF_INTERVAL * flat[f"{bounded}_stderr"])
+    where = (flat[x].values for x in ("restitution", "packing_fraction"))
+    grains = flat["point_grains" if "point_grains" in flat.coords else "grains"].values
+    law = SIZE_LAWS["pressure" if name == RATIO else bounded]
+    slope = 1 / (1 - law.missing(*where, grains))  # not that of two errors, which may both be 0
     value = large if name == RATIO else flat[path] * slope
     squares = errors**2
     others = squares.sel(error_source="total") - squares.sel(error_source="sampling")

@@ -105,6 +105,17 @@ VARIANCE_ROUNDING = (
 )
 
 
+def test_every_average_of_the_table_has_its_error() -> None:
+    """An average without one would spoil the surface of all."""
+    columns = shipped_table().columns
+    names = [name.removesuffix("_stderr") for name in columns if name.endswith("_stderr")]
+    assert len(names) > 10 and "force_ratio_at_1e-05" in names
+    for name in names:
+        known = np.isfinite(columns[name])
+        assert known.sum() >= 100
+        assert np.array_equal(np.isfinite(columns[f"{name}_stderr"]), known), name
+
+
 def test_arrays_broadcast_and_jit_vmap_give_the_same_numbers() -> None:
     alphas, nus = np.array([0.2, 0.5, 0.9]), np.array([[0.3], [0.7]])
     found = jg.validity(alphas, nus)
