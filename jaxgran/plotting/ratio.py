@@ -118,7 +118,8 @@ def ratio_contours(data: MapData) -> Figure:
     """
     data = selection(data)
     require_plane(data)
-    excess, error = data.force_ratio.values - 1.0, data.force_ratio_stderr.values
+    excess = data.force_ratio.values - 1.0
+    error = np.nan_to_num(data.force_ratio_stderr.values)  # NaN where the ratio is 1 in all blocks
     levels = {f"{level:.2f}": float(contour_variable(np.array(level))) for level in EXCESS_LEVELS}
     figure = empty_figure(ONE_COLUMN, height=3.3)
     axes = figure.add_subplot()
