@@ -65,6 +65,14 @@ def test_contours_lie_on_the_isolines() -> None:
         assert np.abs(error).max() < 0.1 * cell**2  # linear interpolation is of second order
 
 
+def test_a_value_without_a_known_error_is_measured() -> None:
+    data = ratio_dataset(5, 6)
+    data.force_ratio_stderr.values[0, 0] = np.nan
+    (legend,) = ratio_contours(data).legends
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert "measured" in labels and "no value" not in labels
+
+
 def test_band_spans_one_standard_error() -> None:
     relative_error = 0.2
     figure = ratio_contours(ratio_dataset(10, 12, relative_error))
