@@ -1,14 +1,20 @@
-"""Fresh flows at random points of the reference map, which its intervals are judged on.
+"""Fresh flows, which the intervals of the reference map and the law of the size are judged on.
 
-40 points, uniform in ln(1 − α) and ν over the range of the map; N = 6400 up to ν = 0.71 and 2500
-above, dt = 1e-4, one run per point sampled over six correlation strains. Nothing is fitted to them.
+40 random points, uniform in ln(1 − α) and ν over the range of the map; N = 6400 up to ν = 0.71 and
+2500 above, dt = 1e-4, one run per point sampled over six correlation strains. The large flows have
+102,400 grains, four times as many as any that the law of the size was fitted to, at dt = 3e-4;
+their long waves need a preparation of 250 strains. Nothing is fitted to any of them.
 
-    python -m benchmarks reference_runs           # 20 minutes on one core
-    python -m benchmarks reference_runs --quick   # 3 points of 64 grains, dt = 1e-3, under a minute
+    python -m benchmarks reference_runs               # 20 minutes on one core
+    python -m benchmarks reference_runs --part large  # an hour on two cores
+    python -m benchmarks reference_runs --quick       # 3 points of 64 grains, under a minute
 """
 
+import multiprocessing
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -16,6 +22,7 @@ import xarray as xr
 import jaxgran as jg
 from benchmarks.output import Output
 from benchmarks.reference_map import DENSE, LOOSE, RESTITUTIONS
+from jaxgran.environment import usable_cores
 from jaxgran.maps.schema import flattened
 
 OBSERVABLES = (
@@ -28,20 +35,39 @@ OBSERVABLES = (
 FULL = {"points": 40, "grains": [6400, 2500], "timestep": 1e-4}  # of loose and of dense flows
 QUICK = {"points": 3, "grains": [64, 64], "timestep": 1e-4}
 FIRST_SEED = 9000  # of no map
+LARGE_FLOWS = ((0.3, 0.72), (0.1, 0.5), (0.8, 0.7), (0.5, 0.3))  # the dearest first
+LARGE = {"grains": 102_400, "timestep": 3e-4, "equilibrate": 250.0, "strain": 400.0}
+QUICK_LARGE = {"grains": 400, "timestep": 1e-3, "equilibrate": 1.0, "strain": 8.0}
 
 
-def run(output: Output) -> None:
-    """Run the flows, print each, and write ``reference_runs`` as JSON."""
-    plan, start = QUICK if output.quick else FULL, time.perf_counter()
-    rows = []
-    for row in fresh_rows(**plan):
-        rows.append(row)
-        print(
-            f"{len(rows)} of {plan['points']}: {row}, {time.perf_counter() - start:.0f} s",
-            flush=True,
-        )
+def run(output: Output, part: str = "random") -> None:
+    """Run the flows of a part, print each, and write them as JSON."""
+    start = time.perf_counter()
+    if part == "large":
+        plan = QUICK_LARGE if output.quick else LARGE
+        with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
+            rows = list(pool.map(partial(large_row, plan), LARGE_FLOWS))
+        name = "reference_runs_large"
+    else:
+        plan, name, rows = QUICK if output.quick else FULL, "reference_runs", []
+        for row in fresh_rows(**plan):
+            rows.append(row)
+            print(
+                f"{len(rows)} of {plan['points']}: {row}, {time.perf_counter() - start:.0f} s",
+                flush=True,
+            )
     head = {**plan, "first_seed": FIRST_SEED, "seconds": round(time.perf_counter() - start)}
-    output.write_rows("reference_runs", head, "rows", rows)
+    output.write_rows(name, head, "rows", rows)
+
+
+def large_row(plan: dict, flow: tuple[float, float]) -> dict:
+    """Averages of a large flow, printed when it is done."""
+    one = {"restitution": flow[0], "packing_fraction": flow[1], "grains": plan["grains"]}
+    begin = time.process_time()
+    data = jg.ratio_map(**(plan | one), seeds=1, first_seed=FIRST_SEED, workers=1)
+    row = one | _row(data) | {"cpu_seconds": round(time.process_time() - begin)}
+    print(row, flush=True)
+    return row
 
 
 def random_points(count: int) -> Iterator[tuple[float, float]]:
