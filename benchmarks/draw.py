@@ -17,13 +17,13 @@ from benchmarks import (
     paper,
     scaling,
     size_figures,
-    speed_vs_accuracy,
     stability,
     timestep_study,
     validation,
 )
 from benchmarks.output import RESULTS, Output
 from benchmarks.pages import read
+from benchmarks.peers import chart
 from jaxgran.maps.results import open_map
 from jaxgran.reference.corrected_shear import MEASURED_LAWS
 
@@ -43,8 +43,8 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     ),
     "gradients": lambda: gradients.draw(read("gradients")["flows"]),
     "scaling": lambda: scaling.draw(read("scaling"), read("scaling")["exponents"]),
-    "speed_vs_accuracy": lambda: speed_vs_accuracy.draw(read("peers"), read("speed_vs_accuracy")),
-    "stability": lambda: stability.draw(read("stability")["cells"]),
+    "speed_vs_accuracy": lambda: chart.draw(read("speed_vs_accuracy")),
+    "stability": lambda: stability.draw(read("stability")["rows"]),
     "timestep_study": lambda: timestep_study.draw(read("timestep_study")["flows"]),
     "validation": lambda: validation.draw(
         read("validation")["rows"], read("contact_duration")["reference"]

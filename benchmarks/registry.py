@@ -168,14 +168,6 @@ BENCHMARKS = (
         one_core=True,
     ),
     Benchmark(
-        "peers",
-        "How long do other programs take for stresses within 3 % of those of rigid grains?",
-        (18, 3),
-        ("peers.json",),
-        one_core=True,
-        module="peers.compare",
-    ),
-    Benchmark(
         "scaling",
         "How do time and memory grow with the number of grains, and time with the time step?",
         (4, 1.5),
@@ -198,10 +190,11 @@ BENCHMARKS = (
     ),
     Benchmark(
         "speed_vs_accuracy",
-        "What does accuracy cost in a whole run?",
-        (11, 1),
+        "What does accuracy cost, here and in other programs?",
+        (25, 3),
         ("speed_vs_accuracy.json", "speed_vs_accuracy.png"),
         one_core=True,
+        module="peers.compare",
     ),
     Benchmark(
         "collection",
@@ -262,8 +255,8 @@ BENCHMARKS = (
     ),
     Benchmark(
         "stability",
-        "What fails first as the time step grows and the packing becomes dense?",
-        (6, 0.5),
+        "Where do methods fail, from loose and elastic to dense and dissipative flows?",
+        (40, 2),
         ("stability.json", "stability.png"),
         one_core=True,
     ),

@@ -31,7 +31,7 @@ MOST_SKIN, NARROW_SKIN = (
 )  # σ, added to the reach of a near pair, and the same times the packing fraction
 HEADROOM = 1.5  # a list stands until a disc is faster than this, over the fastest when it was made
 LEAST_SPEED = 1e-3  # σ/t, of the fastest disc, so that the life of a list is finite
-MOST_COLLISIONS = 20_000_000  # of a block; more are taken for a collapse
+MOST_COLLISIONS = 20_000_000  # of a block, more of which are taken for a collapse
 
 SUMS = (
     "duration",
@@ -109,7 +109,11 @@ def discs_of(state: jg.State) -> Discs:
 
 
 def sheared(
-    discs: Discs, law: Law, duration: float, blocks: int = 1
+    discs: Discs,
+    law: Law,
+    duration: float,
+    blocks: int = 1,
+    most_collisions: int = MOST_COLLISIONS,
 ) -> tuple[Discs, dict[str, np.ndarray]]:
     """The discs after a time, and the sums over each of the blocks into which it is divided, arrays
     (blocks,).
@@ -130,9 +134,9 @@ def sheared(
             **{name: getattr(discs, name).copy() for name in ("positions", "velocities", "last")}
         )
         tilt = _advance(
-            discs, Law(*map(float, law)), duration / blocks, skin, cells, MOST_COLLISIONS, row
+            discs, Law(*map(float, law)), duration / blocks, skin, cells, most_collisions, row
         )
-        if row[COLLISIONS] >= MOST_COLLISIONS:
+        if row[COLLISIONS] >= most_collisions:
             raise RuntimeError(
                 "more collisions than can be carried out, as in an inelastic collapse."
             )

@@ -1,20 +1,19 @@
-"""Peers on the same flows: seconds of one core for a unit of strain against the errors of pressure
-and shear stress.
+"""Speed against accuracy: what a unit of strain costs, and how wrong pressure and shear stress are.
 
-jaxgran, the numba loop and LAMMPS (see the modules beside this one) shear the same discs from the
-same steady state. Contact dynamics runs at several time steps, soft discs at several stiffnesses,
-whose time step is a fixed share of a
-contact: both trade time for accuracy. Each has its own process, all share one core and take turns,
-  round after round. Times are medians of the CPU time over the rounds; wall-clock times stand
-  beside them. What a first call takes longer (compilation) is reported apart. Errors are relative
-  to a reference, contact dynamics at a time step of 3e-5 and a tolerance of 1e-6 over a longer
-  strain.
+jaxgran, a loop of the classical Gauss–Seidel scheme, soft discs in LAMMPS and an event-driven
+program (see the modules beside this one) shear the same discs from the same steady state. Each
+trades time for accuracy by one setting: contact dynamics by its time step, soft discs by their
+stiffness, whose time step is a fixed share of a contact. Event-driven discs have none; where they
+collapse the row says so. All programs share one core and take turns, round after round, each in its
+own process. Times are medians of the processor time over the rounds. What a first call takes longer
+(compilation) is reported apart. Errors are relative to a reference: the loop, which shares no code
+with jaxgran, at a time step of 3e-5 and a tolerance of 1e-6 over a longer strain.
 
-The time to an error of 3 % is read off the front of error against time, in logarithms (see
-``front.py``).
+``front.py`` compares equal work: the cheapest settings within 3 %, at overlaps no deeper than those
+of the other program. ``chart.py`` draws the figure.
 
-    python -m benchmarks peers           # about 20 minutes
-    python -m benchmarks peers --quick   # one flow of 256 discs, under 3 minutes
+    python -m benchmarks speed_vs_accuracy           # about 25 minutes
+    python -m benchmarks speed_vs_accuracy --quick   # one flow of 256 discs, under 3 minutes
 """
 
 import os
@@ -27,18 +26,21 @@ import numpy as np
 
 import jaxgran as jg
 from benchmarks.output import Output
-from benchmarks.peers import jaxgran_itself, lammps, numba_rival
+from benchmarks.peers import event_driven, jaxgran_itself, lammps, numba_rival
+from benchmarks.peers.chart import draw
 from benchmarks.peers.front import OBSERVABLES, TARGET, table
 from benchmarks.peers.problem import Discs, Flow, Stress
 from benchmarks.peers.workers import Worker
 from jaxgran.statistics import jackknife
 
-PEERS = (jaxgran_itself, numba_rival, lammps)
+PEERS = (jaxgran_itself, numba_rival, lammps, event_driven)
 REFERENCE_TIMESTEP = 3e-5
 
 
 class Case(NamedTuple):
-    """A flow, the strain of a round, the rounds of all settings and those of the reference."""
+    """A flow, the strain of a round, the most rounds of a setting and the rounds of the
+    reference.
+    """
 
     flow: Flow
     strain: float
@@ -47,17 +49,22 @@ class Case(NamedTuple):
 
 
 class Plan(NamedTuple):
+    """Flows, discs of each, and the seconds after which a setting has no more rounds; it has
+    ``FEWEST_ROUNDS`` in any case.
+    """
+
     cases: tuple[Case, ...]
     discs: int
-    most_seconds: float  # for a unit of strain, beyond which a setting is left out
+    seconds: float
 
 
+FEWEST_ROUNDS = 12
 CASES = (
-    Case(Flow(0.8, 0.6), 4, 12, 150),
-    Case(Flow(0.5, 0.7), 4, 12, 150),
-    Case(Flow(0.5, 0.8), 2, 16, 60),
+    Case(Flow(0.8, 0.6), 4, 60, 600),
+    Case(Flow(0.5, 0.7), 4, 60, 600),
+    Case(Flow(0.5, 0.8), 4, 60, 120),
 )
-FULL = Plan(CASES, 1000, 2.8)
+FULL = Plan(CASES, 1000, 25)
 QUICK = Plan((Case(Flow(0.8, 0.6), 2, 4, 40),), 256, 1)
 
 
@@ -82,13 +89,12 @@ def run(output: Output) -> None:
     print(table(flows))
     result = {
         "hardware": output.hardware | ({"lammps": lammps.version()} if lammps in peers else {}),
-        "discs": plan.discs,
-        "most_seconds": plan.most_seconds,
         "target": TARGET,
         "left_out": left_out,
         "flows": flows,
     }
-    output.write_json("peers", result)
+    output.write_json("speed_vs_accuracy", result)
+    output.write_picture(draw(result), "speed_vs_accuracy")
 
 
 def compare_peers(plan: Plan, case: Case, peers: list) -> dict:
@@ -104,28 +110,36 @@ def compare_peers(plan: Plan, case: Case, peers: list) -> dict:
     for peer, worker in zip(peers, workers, strict=True):
         for curve, settings in peer.CURVES.items():
             for setting in settings:
-                rows.append(
-                    first_looks(worker, len(rows), discs, case, curve, setting, plan.most_seconds)
-                )
+                rows.append(first_looks(worker, len(rows), discs, case, curve, setting))
                 if "failure" not in rows[-1]:
                     runs[len(rows) - 1] = worker
     stresses, clocks, depths = ({k: [] for k in runs} for _ in range(3))
     for number in range(case.rounds):
         order = list(runs) if number % 2 == 0 else list(reversed(runs))
         for k in order:
-            stress, clock = runs[k].advance(k)
+            spent = sum(processor for _, processor in clocks[k])
+            if number >= FEWEST_ROUNDS and spent > plan.seconds:
+                continue
+            try:
+                stress, clock = runs[k].advance(k)
+            except RuntimeError as failure:
+                rows[k]["failure"] = str(failure)
+                del runs[k]
+                continue
             stresses[k].append(stress)
             clocks[k].append(clock)
             depths[k].append(runs[k].overlaps(k))
     for k, run in runs.items():
         wall, cpu = np.median(clocks[k], axis=0) / case.strain
-        mean, largest = np.array(depths[k]).T
+        mean, largest = np.mean(depths[k], axis=0)
+        values = averages(stresses[k])
         rows[k] |= {
+            "rounds": len(clocks[k]),
             "cpu_seconds_per_strain": float(cpu),
             "wall_seconds_per_strain": float(wall),
-            "mean_overlap": float(mean.mean()),
-            "largest_overlap": float(largest.max()),
-            "values": (values := averages(stresses[k])),
+            "mean_overlap": float(mean),
+            "largest_overlap": float(largest),
+            "values": values,
             "errors": {name: relative(values[name], right[name]) for name in OBSERVABLES},
         }
         run.close(k)
@@ -138,6 +152,7 @@ def compare_peers(plan: Plan, case: Case, peers: list) -> dict:
     }
     return {
         **flow._asdict(),
+        "discs": plan.discs,
         **plan_of_flow,
         "reference": right,
         "reference_seconds_per_strain": seconds,
@@ -163,12 +178,11 @@ def first_looks(
     case: Case,
     curve: str,
     setting: float,
-    most_seconds: float,
 ) -> dict:
     """The row of a setting so far, and its run begun, past a round that is left out.
 
     The first call is that of a short run apart, so that it shows compilation. Where a program
-    fails, or would take longer than the plan allows, the row says so.
+    fails the row says so.
     """
     row = {"peer": worker.peer, "curve": curve, "setting": setting}
     try:
@@ -176,8 +190,6 @@ def first_looks(
         (first, _), (_, again) = worker.advance(key)[1], worker.advance(key)[1]
         worker.close(key)
         row["first_call_seconds"] = first - again
-        if 10 * again > most_seconds:
-            return row | {"failure": f"takes {10 * again:.1f} s for a unit of strain"}
         worker.begin(key, discs, case.flow, curve, setting, case.strain)
         worker.advance(key)
     except Exception as failure:  # of a program that is not ours to mend
@@ -186,15 +198,16 @@ def first_looks(
 
 
 def averages(stresses: Sequence[Stress]) -> dict[str, tuple[float, float]]:
-    """Means over the rounds and their standard errors."""
+    """Means over the rounds and their standard errors; without what a program does not know."""
     rounds = {
-        name: np.array([[getattr(stress, name) for stress in stresses]]) for name in OBSERVABLES
+        name: np.array([[getattr(stress, name) for stress in stresses]]) for name in Stress._fields
     }
     rounds["count"] = np.ones((1, len(stresses)))
     value, error = jackknife(
-        lambda sums: {name: sums[name] / sums["count"] for name in OBSERVABLES}, rounds
+        lambda sums: {name: sums[name] / sums["count"] for name in Stress._fields}, rounds
     )
-    return {name: (float(value[name]), float(error[name])) for name in OBSERVABLES}
+    known = [name for name in Stress._fields if np.isfinite(value[name])]
+    return {name: (float(value[name]), float(error[name])) for name in known}
 
 
 def relative(value: tuple[float, float], right: tuple[float, float]) -> tuple[float, float]:

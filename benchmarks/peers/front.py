@@ -1,100 +1,96 @@
-"""From times and errors to a table: the time that an error of 3 % takes."""
+"""From times and errors to a table: what stresses within 3 % take, at equal overlaps."""
 
-import math
+from typing import NamedTuple
 
 OBSERVABLES = ("pressure", "shear_stress")
 TARGET = 0.03
 COST = "cpu_seconds_per_strain"
 
 
-def largest_error(row: dict, names: tuple[str, ...]) -> float:
-    """The largest of some errors of a row, without sign."""
-    return max(abs(row["errors"][name][0]) for name in names)
+class Choice(NamedTuple):
+    """A setting of a program, and whether its stresses are within the target."""
+
+    row: dict
+    reached: bool
 
 
-def time_to_target(rows: list[dict], names: tuple[str, ...], cost: str = COST) -> tuple[float, str]:
-    """Seconds for a unit of strain at which the front of a curve falls to ``TARGET``.
+def rows_of(flow: dict, curve: str) -> list[dict]:
+    """The rows of a program that ran, coarse before fine."""
+    return [row for row in flow["rows"] if row["curve"] == curve and "errors" in row]
 
-    The rows stand in the order of their settings, coarse before fine. Errors change sign along a
-    curve, so a row that meets the target by chance, while a finer one misses it beyond its standard
-    error, is left out. The front is made of the rows that are more accurate than all that are
-    cheaper, and is interpolated in logarithms. The sign is "=" for an interpolated time, "<" where
-    the cheapest row is better already, ">" where none is as good: the time is that of the cheapest
-    or the most accurate row then, and NaN where there is no row.
+
+def cheapest(rows: list[dict]) -> Choice | None:
+    """The coarsest setting whose stresses are within the target, or the finest if none is.
+
+    Errors change sign along a curve. So a setting that meets the target by chance, while a finer
+    one misses it beyond twice its standard error, is passed over.
     """
-    front: list[dict] = []
-    rows = [row for row in rows if "errors" in row]
-    last_miss = max((k for k, row in enumerate(rows) if _misses(row, names)), default=-1)
-    rows = [
-        row for k, row in enumerate(rows) if k >= last_miss or largest_error(row, names) > TARGET
-    ]
-    for row in sorted(rows, key=lambda row: row[cost]):
-        if not front or largest_error(row, names) < largest_error(front[-1], names):
-            front.append(row)
-    if not front:
-        return math.nan, ">"
-    if largest_error(front[0], names) <= TARGET:
-        return front[0][cost], "<"
-    for dear, cheap in zip(front[1:], front, strict=False):
-        if largest_error(dear, names) <= TARGET:
-            worse, better = (math.log(largest_error(row, names)) for row in (cheap, dear))
-            share = (worse - math.log(TARGET)) / (worse - better)
-            return cheap[cost] ** (1 - share) * dear[cost] ** share, "="
-    return front[-1][cost], ">"
+    if not rows:
+        return None
+    misses = [k for k, row in enumerate(rows) if _misses(row)]
+    reached = [row for row in rows[max(misses, default=-1) + 1 :] if _largest_error(row) <= TARGET]
+    return Choice(reached[0], True) if reached else Choice(rows[-1], False)
 
 
-def _misses(row: dict, names: tuple[str, ...]) -> bool:
-    """Whether an error exceeds the target by more than its standard error."""
-    return any(
-        abs(error) - noise > TARGET for error, noise in (row["errors"][name] for name in names)
-    )
+def equal_work(flow: dict, curve: str) -> tuple[Choice, Choice] | None:
+    """The cheapest settings of jaxgran and of another program within the target, where jaxgran's
+    overlaps are no deeper than those of the other; its finest setting where all are deeper.
+    """
+    theirs = cheapest(rows_of(flow, curve))
+    if theirs is None:
+        return None
+    depth = theirs.row["largest_overlap"]
+    ours = rows_of(flow, "jaxgran")
+    found = cheapest([row for row in ours if row["largest_overlap"] <= depth] or ours[-1:])
+    return None if found is None else (found, theirs)
+
+
+def ratio(flow: dict, curve: str) -> str:
+    """Time of another program over that of jaxgran; "> " where it does not reach the target."""
+    found = equal_work(flow, curve)
+    if found is None:
+        return "–"
+    ours, theirs = found
+    if not ours.reached:
+        return "–"
+    sign = "" if theirs.reached else "> "
+    return f"{sign}{float(f'{theirs.row[COST] / ours.row[COST]:.2g}'):,g}"
 
 
 def table(flows: list[dict]) -> str:
-    """Markdown: seconds of a core for a unit of strain at 3 %, a column for each flow, and their
-    ratio to jaxgran's.
+    """Markdown: for each flow the cheapest setting of each program, its microseconds for a grain
+    and a unit of strain, and its time over jaxgran's at overlaps no deeper.
     """
-    names = [f"α {flow['restitution']:g}, ν {flow['packing_fraction']:g}" for flow in flows]
-    lines = ["| | " + " | ".join(f"{name} | over jaxgran's" for name in names) + " |"]
-    lines.append("| --- |" + " --- |" * 2 * len(names))
-    for curve in dict.fromkeys(row["curve"] for flow in flows for row in flow["rows"]):
-        cells = [
-            f"{_time(*time_to_target(_rows(flow, curve), OBSERVABLES))} | "
-            f"{ratio(flow, curve, COST)}"
-            for flow in flows
-        ]
-        lines.append(f"| {curve} | " + " | ".join(cells) + " |")
+    heads = "α, ν", "program", "setting", "µs", "error of p", "of τ", "overlap (σ)", "over jaxgran"
+    lines = [f"| {' | '.join(heads)} |", "| --- |" + " --- |" * (len(heads) - 1)]
+    for flow in flows:
+        where = f"{flow['restitution']:g}, {flow['packing_fraction']:g}"
+        for curve in ("jaxgran", "numba loop", "LAMMPS", "event-driven"):
+            found = cheapest(rows_of(flow, curve))
+            if found is None:
+                lines.append(f"| {where} | {curve} | – | it collapses | – | – | – | – |")
+                continue
+            row = found.row
+            cells = [f"{100 * e:+.1f} ± {100 * s:.1f} %" for e, s in map(tuple, _errors(row))]
+            cost = 1e6 * row[COST] / flow["discs"]
+            over = "1" if curve == "jaxgran" else ratio(flow, curve)
+            setting = {"LAMMPS": "k = ", "event-driven": "– "}.get(curve, "dt = ")
+            setting += "" if curve == "event-driven" else f"{row['setting']:.0e}"
+            lines.append(
+                f"| {where} | {curve} | {setting.strip()} | {cost:.2g} | {cells[0]} | {cells[1]} | "
+                f"{row['largest_overlap']:.2g} | {over} |"
+            )
     return "\n".join(lines)
 
 
-def _rows(flow: dict, curve: str) -> list[dict]:
-    return [row for row in flow["rows"] if row["curve"] == curve]
+def _errors(row: dict) -> list[tuple[float, float]]:
+    return [row["errors"][name] for name in OBSERVABLES]
 
 
-def _time(seconds: float, sign: str) -> str:
-    """A time; "not reached" where the target is not met, "< " before that of the cheapest setting
-    if it meets it.
-    """
-    return "not reached" if sign == ">" else f"{'< ' if sign == '<' else ''}{seconds:.2g}"
+def _largest_error(row: dict) -> float:
+    return max(abs(error) for error, _ in _errors(row))
 
 
-def _two_digits(value: float) -> str:
-    return f"{float(f'{value:.2g}'):,g}"
-
-
-def ratio(flow: dict, curve: str, cost: str) -> str:
-    """Time of a curve over that of jaxgran, "~" where both have been run no cheaper.
-
-    Where the dearest setting of a curve misses the target beyond its standard error, the target
-    costs more than that.
-    """
-    (ours, our_sign), (theirs, sign) = (
-        time_to_target(_rows(flow, name), OBSERVABLES, cost) for name in ("jaxgran", curve)
-    )
-    last = [row for row in _rows(flow, curve) if "errors" in row][-1:]
-    if our_sign != ">" and last and _misses(last[0], OBSERVABLES):
-        return f"> {_two_digits(last[0][cost] / ours)}"
-    if ">" in (our_sign, sign):
-        return "–"
-    bounds = {("=", "="): "", ("<", "="): "< ", ("=", "<"): "> ", ("<", "<"): "~ "}
-    return f"{bounds[sign, our_sign]}{_two_digits(theirs / ours)}" if curve != "jaxgran" else "1"
+def _misses(row: dict) -> bool:
+    """Whether an error exceeds the target by more than twice its standard error."""
+    return any(abs(error) - 2 * noise > TARGET for error, noise in _errors(row))

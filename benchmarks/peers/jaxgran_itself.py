@@ -1,5 +1,5 @@
-"""jaxgran as a peer of the others: several time steps, at the default tolerance and a coarse one,
-midpoint rule.
+"""jaxgran as a peer of the others: several time steps at the default tolerance, and several
+tolerances at one time step; midpoint rule.
 """
 
 import jax
@@ -11,16 +11,21 @@ from benchmarks.peers.problem import Discs, Flow, Run, Stress
 from jaxgran.model.grains import Grains
 
 TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
-CURVES = {"jaxgran": TIMESTEPS, "jaxgran, tolerance 1e-2": TIMESTEPS[1:-1]}
-TOLERANCES = {"jaxgran": 1e-4, "jaxgran, tolerance 1e-2": 1e-2, "reference": 1e-6}
+TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-6)
+BY_TOLERANCE = "jaxgran by tolerance"
+CURVES = {"jaxgran": TIMESTEPS, BY_TOLERANCE: TOLERANCES}
+DEFAULT_TOLERANCE, MIDDLE_TIMESTEP = 1e-4, 1e-3
 
 
 def missing() -> str | None:
     return None
 
 
-def begin(discs: Discs, flow: Flow, curve: str, timestep: float, duration: float) -> Run:
-    """A run at one time step; ``curve`` names the tolerance."""
+def begin(discs: Discs, flow: Flow, curve: str, setting: float, duration: float) -> Run:
+    """A run at one time step or tolerance."""
+    timestep, tolerance = (
+        (MIDDLE_TIMESTEP, setting) if curve == BY_TOLERANCE else (setting, DEFAULT_TOLERANCE)
+    )
     law = jg.ShearFlow(
         grains=len(discs.radii),
         restitution=flow.restitution,
@@ -28,7 +33,7 @@ def begin(discs: Discs, flow: Flow, curve: str, timestep: float, duration: float
         timestep=timestep,
         shear_rate=flow.shear_rate,
     )
-    solver, strain = jg.BarzilaiBorwein(TOLERANCES[curve]), duration * flow.shear_rate
+    solver, strain = jg.BarzilaiBorwein(tolerance), duration * flow.shear_rate
     grains = Grains(jnp.asarray(discs.radii), jnp.asarray(discs.masses))
     arrays = (
         np.asarray(x, float) for x in (discs.positions, discs.velocities, discs.side, discs.tilt)
@@ -43,8 +48,7 @@ def begin(discs: Discs, flow: Flow, curve: str, timestep: float, duration: float
             jg.sample(law, state, strain, blocks=1, solver=solver)
         )
         sample = jax.tree.map(np.asarray, sample)
-        averages = sample.averages
-        return Stress(float(averages["pressure"]), float(averages["shear_stress"]))
+        return Stress(*(float(sample.averages[name]) for name in Stress._fields))
 
     return Run(advance, lambda: discs_of(state))
 

@@ -35,10 +35,14 @@ class Discs(NamedTuple):
 
 
 class Stress(NamedTuple):
-    """Kinetic and contact stress together, averaged over one advance."""
+    """Kinetic and contact stress together, averaged over one advance, and the granular temperature
+    and force ratio of programs that know them.
+    """
 
     pressure: float
     shear_stress: float
+    granular_temperature: float = math.nan
+    force_ratio: float = math.nan
 
 
 class Run(NamedTuple):
