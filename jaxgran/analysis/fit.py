@@ -83,8 +83,8 @@ def fit_trajectory(
 
     It recovers one α for all windows. In ``tests/test_fit.py``, three windows of 32 grains over a
     strain of 0.05, with noise of 1e-3 σ and 1e-2 σ/t, give α = 0.73 from a first guess of 0.5 with
-    an error of 0.003 at most. Fitted starts come back with 0.7 of the noise with which they were
-    seen, but half of these fits are refused: noise at the start leads to other collisions. Windows
+    errors of 0.001 to 0.003 in four sets. Fitted starts come back with 0.7 of the noise with which
+    they were seen, but two of four such fits are refused: noise leads to other collisions. Windows
     in which α changes who collides, and sizes and masses, cannot be fitted.
 
     Args:
