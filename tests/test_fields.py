@@ -15,6 +15,7 @@ from flows import EXACT, GRAINS
 from jax import lax
 from scipy.integrate import quad
 
+from jaxgran.analysis import fields as fields_module
 from jaxgran.analysis.fields import Fields, fields_at, grid
 from jaxgran.contact.network import Contacts
 from jaxgran.dynamics.snapshots import Snapshot, collided, flown, snapshot
@@ -269,6 +270,15 @@ def test_fields_are_those_of_every_image(seen, points) -> None:
 def assert_same(one: Fields, other: Fields, tolerance: float) -> None:
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance * max(1, np.max(np.abs(b))))
+
+
+def test_blocks_out_of_reach_are_skipped_without_a_trace(seen, points, monkeypatch) -> None:
+    """Grains and contacts in one block, of which none is skipped, and in blocks of four."""
+    width = 0.1
+    whole = fields_at(seen, points, width)
+    monkeypatch.setattr(fields_module, "_BLOCK", 4)
+    in_blocks = jax.jit(fields_module._fields_at.__wrapped__)(seen, points, width)
+    assert_same(in_blocks, whole, 1e-14)
 
 
 def test_two_discs_that_collide_have_known_fields(scene) -> None:

@@ -134,4 +134,4 @@ def cluster_share(snapshots: Snapshot) -> ClusterShare:
         "many": by_time(len(sizes), load.time, carried * in_cluster),
     }
     share = with_errors(lambda s: {"share": ratio(s["many"], s["all"])}, sums)["share"]
-    return ClusterShare(*(Measured(*one) for one in zip(*share, strict=True)))
+    return ClusterShare(*map(Measured, *share))

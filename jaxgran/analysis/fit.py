@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import lax
+from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
@@ -35,6 +36,7 @@ HORIZON = 1.0
 _RATE = 0.05  # of Adam at the beginning; it falls to zero
 _ROBUST = 0.75  # share of the iterations that minimise the sum of logarithms
 _MOST_ITERATIONS = 100_000
+_SOLVED = 1e-8  # residual of conjugate gradients, over the right-hand side
 _SOLVER = BarzilaiBorwein(tolerance=1e-9, max_steps=20_000)
 
 
@@ -79,6 +81,12 @@ def fit_trajectory(
     """Infer the restitution of a flow, and where asked the states at the start, from short windows
     of it.
 
+    It recovers one α for all windows. In ``tests/test_fit.py``, three windows of 32 grains over a
+    strain of 0.05, with noise of 1e-3 σ and 1e-2 σ/t, give α = 0.73 from a first guess of 0.5 with
+    errors of 0.001 to 0.003 in four sets. Fitted starts come back with 0.7 of the noise with which
+    they were seen, but two of four such fits are refused: noise leads to other collisions. Windows
+    in which α changes who collides, and sizes and masses, cannot be fitted.
+
     Args:
       flow: parameters of the flow; its restitution is the first guess. A time step much shorter
         than the noise of the positions over the speeds is best.
@@ -116,17 +124,18 @@ def fit_trajectory(
     events = 8 + 3 * needed // 2 if events is None else events
     require_whole("events", events, needed, MAX_STEPS, "the most steps of an advance")
     noises = {"positions": jnp.asarray(position_noise), "velocities": jnp.asarray(velocity_noise)}
+    windows = batch, end
     fitted = {"velocities": velocities, "positions": positions}
     offsets = {name: jnp.zeros(shape) for name, chosen in fitted.items() if chosen}
     unknowns = jnp.asarray(flow.restitution, float), offsets
-    _information(events, batch, end, noises, unknowns)
+    _information(events, windows, noises, unknowns)
     with jax.numpy_dtype_promotion("standard"):  # which optax needs
-        unknowns, misfit, status = _minimised(events, iterations, batch, end, noises, unknowns)
+        unknowns, misfit, status = _minimised(events, iterations, windows, noises, unknowns)
     if np.any(np.asarray(status) == Status.capacity):
         raise InputError(
             f"events must be more than {events}: some window has more steps with contacts."
         )
-    information = _information(events, batch, end, noises, unknowns)
+    information = _information(events, windows, noises, unknowns)
     freedom = 2 * start.positions.size - 1
     misfit = np.asarray(misfit) / freedom
     if not misfit[-1] <= 1 + 5 * np.sqrt(2 / freedom):
@@ -152,11 +161,9 @@ def _moved(state: State, noises: dict[str, Array], offsets: dict[str, Array]) ->
 
 
 def _residuals(
-    events: int, noises: dict[str, Array], window: Any, restitution: Array, offsets: dict
-) -> tuple[Array, Array]:
-    """Deviations of a window (grains, 4) at its end in standard deviations, positions first; and
-    its status.
-    """
+    events: int, noises: dict[str, Array], window: Any, restitution: Array, offsets: Any
+) -> tuple[Float[Array, "grains 4"], Array]:
+    """Deviations of a window at its end in standard deviations, positions first; and its status."""
     (flow, state, steps), end = window
     later, start = replace(flow, restitution=restitution), _moved(state, noises, offsets)
     after, tally = advance(later, start, steps, events=events, moving_contacts=True, solver=_SOLVER)
@@ -168,14 +175,14 @@ def _residuals(
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _minimised(
-    events: int, iterations: int, batch: Any, end: State, noises: dict[str, Array], unknowns: Any
+    events: int, iterations: int, windows: Any, noises: dict[str, Array], unknowns: Any
 ) -> tuple[Any, Array, Array]:
     """The unknowns at the minimum, and χ² and the worst status of each iteration."""
 
     def objective(unknowns: Any, robust: Array) -> tuple[Array, tuple[Array, Array]]:
         restitution, offsets = unknowns
         residuals, status = lax.map(
-            lambda x: _residuals(events, noises, x[0], restitution, x[1]), ((batch, end), offsets)
+            lambda x: _residuals(events, noises, x[0], restitution, x[1]), (windows, offsets)
         )
         squares = jnp.sum(residuals**2, axis=-1)
         known = sum(jnp.sum(x**2) for x in offsets.values())
@@ -198,11 +205,9 @@ def _minimised(
     return unknowns, misfit, status
 
 
-def _information(
-    events: int, batch: Any, end: State, noises: dict[str, Array], unknowns: Any
-) -> float:
+def _information(events: int, windows: Any, noises: dict[str, Array], unknowns: Any) -> float:
     """The information about α of all windows; an InputError if one is longer than the horizon."""
-    sizes, information = _sensitivities(events, batch, end, noises, unknowns)
+    sizes, information = _sensitivities(events, windows, noises, unknowns)
     longest = float(np.max(sizes))
     if not longest <= HORIZON:
         raise InputError(
@@ -214,26 +219,29 @@ def _information(
 
 @partial(jax.jit, static_argnums=0)
 def _sensitivities(
-    events: int, batch: Any, end: State, noises: dict[str, Array], unknowns: Any
+    events: int, windows: Any, noises: dict[str, Array], unknowns: Any
 ) -> tuple[Float[Array, " windows"], Float[Array, " windows"]]:
     """The rms over the grains of ∂(position)/∂α, and the information about α, of each window.
 
     With deviations r, their slopes J by α and S by the start, which is known to one standard
     deviation, the information is Jᵀ (1 + S Sᵀ)⁻¹ J: half of the curvature of the misfit where the
-    start follows.
+    start follows. Conjugate gradients solve it with products of S and Sᵀ.
     """
     restitution, offsets = unknowns
 
     def of_window(x: Any) -> tuple[Array, Array]:
         window, offsets = x
-        slopes = jax.jacfwd(lambda *at: _residuals(events, noises, window, *at)[0], argnums=(0, 1))
-        by_alpha, by_start = slopes(restitution, offsets)
-        size = jnp.sqrt(jnp.mean(jnp.sum(by_alpha[:, :2] ** 2, axis=-1))) * noises["positions"]
-        slope = explained = by_alpha.ravel()
-        if offsets:  # a matrix of all pairs of deviations
-            rows = [x.reshape(slope.size, -1) for x in by_start.values()]
-            spread = sum((x @ x.T for x in rows), start=jnp.eye(slope.size))
-            explained = jnp.linalg.solve(spread, slope)
-        return size, slope @ explained
 
-    return lax.map(of_window, ((batch, end), offsets))
+        def residuals(restitution: Array, offsets: dict[str, Array]) -> Array:
+            return _residuals(events, noises, window, restitution, offsets)[0]
+
+        by_alpha = jax.jacfwd(residuals)(restitution, offsets)
+        size = jnp.sqrt(jnp.mean(jnp.sum(by_alpha[:, :2] ** 2, axis=-1))) * noises["positions"]
+        if not offsets:
+            return size, jnp.sum(by_alpha**2)
+        _, by_start = jax.linearize(partial(residuals, restitution), offsets)
+        transposed = jax.linear_transpose(by_start, offsets)
+        explained, _ = cg(lambda r: r + by_start(*transposed(r)), by_alpha, tol=_SOLVED)
+        return size, jnp.vdot(by_alpha, explained)
+
+    return lax.map(of_window, (windows, offsets))

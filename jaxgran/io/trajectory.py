@@ -11,17 +11,13 @@ configuration/step             (1,)            –       time steps since the fi
 configuration/box              (6,)            σ, –    L, L, 0, tilt, 0, 0; two dimensions
 particles/position             (grains, 3)     σ       centres, in the box around the origin; z = 0
 particles/velocity             (grains, 3)     σγ̇      peculiar velocities c, before the contacts
-                                                       act; in the laboratory c + γ̇ y x̂, up to the
-                                                       velocity of the origin
+                                                       act; in the laboratory c + γ̇ y x̂
 particles/diameter, /mass      (grains,)       σ, m    diameters and masses
 bonds/group                    (bonds, 2)      –       pairs i < j of grains in loaded contact in
-                                                       the steps that follow,
-                                                       one step or those of a strain
-log/bonds/force                (bonds,)        mσγ̇²    their contact forces, impulse p over dt,
-                                                       mean over these steps
+                                                       the steps of ``force_strain``
+log/bonds/force                (bonds,)        mσγ̇²    their forces p/dt, mean over these steps
 log/particles/contact_force    (grains,)       mσγ̇²    sum of the forces of its bonds, by magnitude
-log/particles/cluster          (grains,)       –       number of its cluster; grains of one cluster
-                                                       are joined by bonds
+log/particles/cluster          (grains,)       –       number of its cluster, joined by bonds
 log/particles/cluster_size     (grains,)       –       grains of its cluster; 1 without bonds
 log/particles/exact_position   (grains, 2)     σ       positions of the state, in [0, L)
 log/particles/exact_velocity   (grains, 2)     σγ̇      velocities of the state
@@ -29,13 +25,11 @@ log/particles/exact_radius     (grains,)       σ       radii; in the first fram
 log/particles/exact_mass       (grains,)       m       masses; in the first frame only
 log/jaxgran/side, /tilt        (1,)            σ, –    side and tilt of the state
 log/jaxgran/strain             (1,)            –       strain since the first frame
-log/jaxgran/force_strain       (1,)            –       strain over which forces are averaged; dt for
-                                                       one step
+log/jaxgran/force_strain       (1,)            –       strain over which forces are averaged
 log/jaxgran/timestep           (1,)            1/γ̇     dt
 log/jaxgran/shear_rate         (1,)            1/t     γ̇
 log/jaxgran/restitution        (1,)            –       α
-log/jaxgran/format_version     (1,)            –       of these chunks; files of another one are
-                                                       refused
+log/jaxgran/format_version     (1,)            –       other versions are refused
 =============================  ==============  ======  =============================================
 """
 
@@ -213,12 +207,10 @@ def _append(path: Path, snapshots: Snapshot, step: int) -> None:
 
 
 def _gsd_frame(snapshots: Any, step: int) -> Any:
-    first, forces = snapshots[0], pair_forces(snapshots)
+    first, (bonds, forces, _) = snapshots[0], pair_forces(snapshots)
     state, grains = first.state, first.state.grains
-    side, tilt, timestep, shear_rate = (
-        x.item() for x in (state.side, state.tilt, first.timestep, first.shear_rate)
-    )
-    count, bonds = len(grains.radii), forces.pairs
+    count, side, tilt = len(grains.radii), state.side.item(), state.tilt.item()
+    strain_of_step = first.timestep.item() * first.shear_rate.item()
     labels, sizes = cluster_labels(bonds[:, 0], bonds[:, 1], count)
     frame: Any = gsd.hoomd.Frame()
     frame.configuration.step = step
@@ -233,29 +225,25 @@ def _gsd_frame(snapshots: Any, step: int) -> Any:
     frame.bonds.types = ["contact"]
     frame.bonds.typeid = np.zeros(len(bonds), np.uint32)
     frame.bonds.group = bonds
-    of_grains = {
-        "contact_force": np.bincount(bonds.ravel(), np.repeat(forces.force, 2), minlength=count),
-        "cluster": labels.astype(np.uint32),
-        "cluster_size": sizes.astype(np.uint32),
-        "exact_position": state.positions,
-        "exact_velocity": state.velocities,
-        **({} if step else {"exact_radius": grains.radii, "exact_mass": grains.masses}),
+    log = {
+        "bonds/force": forces,
+        "particles/contact_force": np.bincount(bonds.ravel(), np.repeat(forces, 2), count),
+        "particles/cluster": labels.astype(np.uint32),
+        "particles/cluster_size": sizes.astype(np.uint32),
+        "particles/exact_position": state.positions,
+        "particles/exact_velocity": state.velocities,
+        "jaxgran/side": [state.side],
+        "jaxgran/tilt": [state.tilt],
+        "jaxgran/strain": [step * strain_of_step],
+        "jaxgran/force_strain": [len(snapshots) * strain_of_step],
+        "jaxgran/timestep": [first.timestep.astype(float)],
+        "jaxgran/shear_rate": [first.shear_rate.astype(float)],
+        "jaxgran/restitution": [first.restitution.astype(float)],
+        "jaxgran/format_version": [FORMAT_VERSION],
     }
-    of_flow = {
-        "side": state.side,
-        "tilt": state.tilt,
-        "strain": step * timestep * shear_rate,
-        "timestep": timestep,
-        "shear_rate": shear_rate,
-        "force_strain": len(snapshots) * timestep * shear_rate,
-        "restitution": np.asarray(first.restitution, np.float64),
-        "format_version": FORMAT_VERSION,
-    }
-    frame.log = {
-        "bonds/force": forces.force,
-        **{f"particles/{name}": np.array(x) for name, x in of_grains.items()},  # writable copies
-        **{f"jaxgran/{name}": np.array([x]) for name, x in of_flow.items()},
-    }
+    if step == 0:
+        log |= {"particles/exact_radius": grains.radii, "particles/exact_mass": grains.masses}
+    frame.log = {name: np.array(values) for name, values in log.items()}  # writable copies
     return frame
 
 
@@ -293,18 +281,20 @@ def _trajectory(frames: Sequence[gsd.hoomd.Frame]) -> Trajectory:
     def column(name: str) -> Any:
         return np.stack([frame.log[name] for frame in frames])
 
+    def number(name: str) -> Any:
+        return column(f"jaxgran/{name}")[:, 0]
+
     radii, masses, positions, velocities = (
         column(f"particles/exact_{x}") for x in ("radius", "mass", "position", "velocity")
     )
-    side, tilt, strain, timestep, shear_rate, restitution = (
-        column(f"jaxgran/{x}")[:, 0]
-        for x in ("side", "tilt", "strain", "timestep", "shear_rate", "restitution")
-    )
+    side = number("side")
     area = np.sum(np.pi * radii[0] ** 2, dtype=np.float64)
     return Trajectory(
-        State(Grains(radii, masses), positions, velocities, side, tilt),
-        np.array([frame.configuration.step for frame in frames]),
-        strain,
-        *(np.array(x[0]) for x in (timestep, shear_rate, restitution)),
+        state=State(Grains(radii, masses), positions, velocities, side, number("tilt")),
+        step=np.array([frame.configuration.step for frame in frames]),
+        strain=number("strain"),
+        timestep=np.array(number("timestep")[0]),
+        shear_rate=np.array(number("shear_rate")[0]),
+        restitution=np.array(number("restitution")[0]),
         packing_fraction=area / np.asarray(side[0], np.float64) ** 2,
     )
