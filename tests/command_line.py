@@ -17,7 +17,7 @@ import typer.main
 from made_up_maps import with_variables
 from synthetic import random_replica
 
-from jaxgran.cli import app, info, measure, merge, run
+from jaxgran.cli import app, info, measure, merge, run, terminal
 from jaxgran.maps import results
 from jaxgran.maps.replica import Advance
 from jaxgran.model.status import Status
@@ -42,7 +42,6 @@ def jaxgran(folder: Path, *arguments: str) -> Outcome:
         pytest.MonkeyPatch.context() as patch,
         redirect_stdout(StringIO()) as out,
         redirect_stderr(StringIO()) as err,
-        pytest.raises(SystemExit) as end,
     ):
         patch.chdir(folder)
         patch.setenv("COLUMNS", "200")
@@ -50,8 +49,8 @@ def jaxgran(folder: Path, *arguments: str) -> Outcome:
         patch.setattr(typer.main, "get_command", commands)
         for module in (info, measure, merge, run):
             patch.setattr(module, "configured_jax", lambda: jax)
-        app.app(prog_name="jaxgran")
-    return Outcome(end.value.code or 0, out.getvalue(), err.getvalue())
+        status = terminal.exit_status(app.app)
+    return Outcome(status, out.getvalue(), err.getvalue())
 
 
 def in_a_process(folder: Path, *arguments: str) -> Outcome:

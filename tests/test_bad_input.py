@@ -332,7 +332,9 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "without repetition": lambda: make_map("grains", (64, 64)),
     "at most 1000000 replicas, points times seeds": lambda: make_map("seeds", 600_000),
     "first_seed must be a whole number of at least 0": lambda: make_map("first_seed", -1),
-    "packing fraction 0.6 to avoid deep overlaps": lambda: make_map("timestep", 0.09),
+    "packing fraction 0.6 to avoid deep overlaps, which is safe for all points, or auto": lambda: (
+        make_map("timestep", 0.09)
+    ),
     "at least 1e-08 / shear rate": lambda: make_map("timestep", 1e-300),
     "at least 160 time steps": lambda: map_of(strain=0.1, timestep=(1e-4, 1e-3)),
     "error must be between 1e-3 and 0.5": lambda: make_map("error", 0.0),

@@ -43,7 +43,7 @@ from jaxgran.maps.results import open_map, write_dataset
 from jaxgran.maps.schema import flattened, path_of
 from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.start import combined
-from jaxgran.model.display import in_brackets
+from jaxgran.model.display import in_brackets, with_error
 from jaxgran.model.status import Status
 from jaxgran.plotting.map_figures import FIGURES
 from jaxgran.sampling.observables import OBSERVABLES
@@ -90,7 +90,7 @@ def no_figures(monkeypatch) -> None:
 
 
 def restitutions(text: str) -> tuple[float, ...]:
-    return options.value("restitution", map_module.MAP_OPTIONS["restitution"], text)
+    return options.parse("restitution", map_module.MAP_OPTIONS["restitution"], text)
 
 
 @given(st.integers(0, 100), st.integers(0, 100), st.integers(2, 50))
@@ -105,18 +105,21 @@ def test_range_includes_both_ends_and_has_equal_gaps(start: int, stop: int, coun
 
 FLOW = "run --restitution 0.5 --packing-fraction 0.6"
 MISTAKES = {  # one for each kind of option, check and file
-    "map --restitution ''": "--restitution must be a number or a list",
-    "map --restitution 0.1:0.9:1": "--restitution must be a number or a list",
+    "map --restitution ''": "'--restitution': must be a number or a list",
+    "map --restitution 0.1:0.9:1": "'--restitution': must be a number or a list",
     "map --grains auto": "--grains auto requires --error",
-    f"{FLOW} --timestep abc": "--timestep must be auto or a number, not 'abc'",
-    "map --preset fast": "--preset must be quick, paper or dense, not 'fast'",
+    f"{FLOW} --timestep abc": "'--timestep': must be auto or a number, not 'abc'",
+    f"{FLOW} --seeds 1.5": "'--seeds': must be a whole number, not '1.5'",
+    "map --preset fast": "'--preset': must be quick, paper or dense, not 'fast'",
     "map --scheduler tcp://127.0.0.1:9 --workers 2": "--scheduler and --workers exclude each other",
     "map --from-map text.nc": "not a NetCDF file",
     f"{FLOW} --frame-strain 1": "--frame-strain requires --trajectory or --movie",
     f"{FLOW} --trajectory flow.gsd --force-strain 1": "--force-strain must be above 0 and at most "
     "the strain between",
-    f"{FLOW} --movie flow.gif --seeds 2": "--trajectory and --movie show one seed: leave out "
-    "--seeds",
+    f"{FLOW} --movie flow.gif --seeds 2": "show one flow of one seed: leave out --seeds",
+    f"{FLOW} --movie flow.gif -n 64,128": "show one flow of one seed: leave out --grains",
+    "where --restitution 0.5": "--restitution and --packing-fraction are required, or --law",
+    "where --law text.nc": "--law must be a file name that ends in .csv",
     f"{FLOW} --resume": "--resume requires --output",
     "run --restitution 0.5": "Missing option '--packing-fraction'",
     "where --restitution 0.7 --packing-fraction 0.9": "--packing-fraction must be between 0.1 and "
@@ -146,6 +149,24 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing_behind(
     assert_one_sentence(outcome)
     assert accepted in outcome.err
     assert files(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("command", "accepted"),
+    {
+        "map --grains auto": "--grains auto requires --error.",
+        f"{FLOW} --timestep abc": "'--timestep': must be auto",
+        "where --restitution 0.7 --packing-fraction 0.9": "--packing-fraction must be between",
+        "where --csv": "--csv and --json exclude each other",
+        "info --draw": "No such option: --draw",
+    }.items(),
+)
+def test_a_mistake_is_an_object_where_json_is_asked_for(
+    command: str, accepted: str, tmp_path: Path
+) -> None:
+    outcome = jaxgran(tmp_path, *command.split(), "--json")
+    error = parsed(outcome.out)["error"]["value"]
+    assert accepted in error and error in outcome.err and outcome.status == 2
 
 
 # What the commands do
@@ -297,6 +318,21 @@ def test_a_reader_that_has_gone_ends_a_command_in_silence(words: str, tmp_path: 
     ) as process:
         process.stdout.close()
         assert (process.stderr.read(), process.wait()) == (b"", 1)
+
+
+def test_run_prints_a_column_for_each_number_of_grains(tmp_path: Path) -> None:
+    words = "run --restitution 0.7 --packing-fraction 0.6 -n 32,64 --strain 1 --equilibrate 1"
+    outcome = jaxgran(tmp_path, *words.split(), "--output", "flow.nc")
+    data = flattened(open_map(tmp_path / "flow.nc")).squeeze()
+    (row,) = (line for line in outcome.out.splitlines() if line.startswith("  collision rate"))
+    for rate, error in zip(
+        data.collision_rate.values, data.collision_rate_stderr.values, strict=True
+    ):
+        assert with_error(rate, error) in row
+    as_json = jaxgran(tmp_path, *words.split(), "--output", "flow.nc", "--resume", "--json")
+    np.testing.assert_array_equal(
+        parsed(as_json.out)["collision_rate"]["value"], data.collision_rate
+    )
 
 
 def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:

@@ -137,7 +137,9 @@ def test_the_file_is_the_law_at_its_points_and_says_what_it_is(tmp_path: Path) -
         "units",
         *(f"unit of {x}" for x in (*MEASURED, LENGTH)),
     } <= {*head}
-    LAW.to_csv(tmp_path / "law.csv", [0.5, 0.6], [0.7])
+    with pytest.raises(jg.InputError, match=r"law\.csv' already exists"):
+        LAW.to_csv(tmp_path / "law.csv", [0.5, 0.6], [0.7])
+    LAW.to_csv(tmp_path / "law.csv", [0.5, 0.6], [0.7], overwrite=True)
     assert read_columns(tmp_path / "law.csv")[1]["restitution"].tolist() == [0.5, 0.6]
     text = (tmp_path / "law.csv").read_text(encoding="utf-8")
     (tmp_path / "law.csv").write_text(

@@ -129,7 +129,7 @@ from jaxgran.cli.terminal import run_program
 
 threading.Thread(target=time.sleep, args=(100,), name="jaxgran-0").start()
 
-def interrupted(prog_name):
+def interrupted(**_):
     print("a sentence")
     raise SystemExit(130)
 

@@ -2,6 +2,7 @@
 verdicts, intervals.
 """
 
+import csv
 import json
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 
 import jaxgran as jg
 from benchmarks import reference
+from jaxgran.model.display import in_brackets
 from jaxgran.reference.surface import Shape, Surface
 from jaxgran.reference.table import FACTORS, MEASURED, shipped_table
 from jaxgran.reference.validity import Validity
@@ -230,6 +232,36 @@ def test_the_command_says_the_verdict_and_every_average(tmp_path: Path) -> None:
     assert outcome.status == 0
     assert jg.validity(0.5, 0.75).verdict() in " ".join(outcome.out.split())
     assert all(name.replace("_", " ") in outcome.out for name in (*MEASURED, "force_ratio"))
+
+
+PLANE = ("--restitution", "0.2,0.5", "--packing-fraction", "0.5:0.7:3")
+
+
+def test_the_command_answers_for_every_pair_of_two_lists(tmp_path: Path) -> None:
+    flows = jg.validity(*np.meshgrid([0.2, 0.5], [0.5, 0.6, 0.7]))
+    table = jaxgran(tmp_path, "where", *PLANE, "--factors").out
+    for name, of in (("pressure", flows.measured), ("chaos", flows.factors)):
+        half = {"pressure": flows.measured_ci95, "chaos": flows.factors_ci95}[name][name]
+        for value, ci95 in zip(of[name].flat, half.flat, strict=True):
+            assert in_brackets(value, ci95) in table
+    printed = json.loads(jaxgran(tmp_path, "where", *PLANE, "--json").out)
+    assert printed["packing_fraction"]["value"] == [0.5, 0.6, 0.7]
+    np.testing.assert_array_equal(printed["error/pressure"]["value"], flows.error["pressure"])
+    lines = list(csv.DictReader(jaxgran(tmp_path, "where", *PLANE, "--csv").out.splitlines()))
+    assert [line["verdict"] for line in lines] == [*flows.verdict().flat]
+    np.testing.assert_array_equal(
+        [float(line["factor/chaos_ci95"]) for line in lines], flows.factors_ci95["chaos"].ravel()
+    )
+
+
+def test_the_command_writes_the_law_of_python_and_replaces_no_file(tmp_path: Path) -> None:
+    jg.constitutive_law().to_csv(tmp_path / "python.csv", [0.2, 0.5])
+    words = ("where", "--restitution", "0.2,0.5", "--law", "shell.csv")
+    outcome = jaxgran(tmp_path, *words)
+    assert outcome == (0, "", "wrote shell.csv\n")
+    assert (tmp_path / "shell.csv").read_bytes() == (tmp_path / "python.csv").read_bytes()
+    assert "already exists; pass --overwrite" in jaxgran(tmp_path, *words).err
+    assert jaxgran(tmp_path, *words, "--overwrite").status == 0
 
 
 def test_intervals_hold_on_fresh_flows_as_often_as_they_say(result: dict) -> None:

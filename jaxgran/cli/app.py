@@ -33,54 +33,17 @@ EXAMPLES = {
     "The options of a command": "jaxgran run --help",
 }
 COMMANDS = {  # with their help here, as python -OO leaves docstrings out
-    "map": (
-        map_command,
-        "Map the force ratio over a plane of flows.",
-        (
-            "Map the force ratio over restitution and packing fraction, with error bars, and draw "
-            "its figures."
-        ),
-        MAP_EXAMPLES,
-    ),
-    "merge": (
-        merge_command,
-        "Merge maps of other parts, seeds or points.",
-        "Merge the files of maps of the same settings and other parts, seeds or points into one.",
-        MERGE_EXAMPLES,
-    ),
-    "plot": (
-        plot_command,
-        "Draw the figures of a map again.",
-        "Draw the figures of a finished map.",
-        PLOT_EXAMPLES,
-    ),
+    "map": (map_command, "Map the force ratio over a plane of flows, and draw it.", MAP_EXAMPLES),
+    "merge": (merge_command, "Merge maps of other parts, seeds or points.", MERGE_EXAMPLES),
+    "plot": (plot_command, "Draw the figures of a map again.", PLOT_EXAMPLES),
     "explore": (
         explore_command,
-        "Write a page to look into a map.",
-        "Write a page to look into a map with a browser: one file that needs nothing else.",
+        "Write a page to look into a map: one file for a browser.",
         EXPLORE_EXAMPLES,
     ),
-    "run": (
-        run_command,
-        "Run one flow, and average it.",
-        "Run one flow to its steady state, sample it, and print its averages with their errors.",
-        RUN_EXAMPLES,
-    ),
-    "where": (
-        where_command,
-        "Say whether kinetic theory holds for a flow.",
-        (
-            "Say what kinetic theory can predict at a restitution and a packing fraction, from a "
-            "map measured once."
-        ),
-        WHERE_EXAMPLES,
-    ),
-    "info": (
-        info_command,
-        "Print what a bug report needs.",
-        "Print versions, processor, devices and folders for a bug report.",
-        INFO_EXAMPLES,
-    ),
+    "run": (run_command, "Run one flow, and print its averages with errors.", RUN_EXAMPLES),
+    "where": (where_command, "Say whether kinetic theory holds for a flow.", WHERE_EXAMPLES),
+    "info": (info_command, "Print what a bug report needs.", INFO_EXAMPLES),
 }
 
 app = typer.Typer(
@@ -91,10 +54,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for name, (command, short_help, long_help, command_examples) in COMMANDS.items():
-    app.command(name, help=long_help, short_help=short_help, epilog=examples(command_examples))(
-        command
-    )
+for name, (command, words, command_examples) in COMMANDS.items():
+    app.command(name, help=words, epilog=examples(command_examples))(command)
 
 
 def _print_version(wanted: bool) -> None:

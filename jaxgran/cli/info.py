@@ -17,12 +17,8 @@ _MEANINGS = {
     "solver": "solver of that engine",
     "cores": "cores of the machine, and of this process",
     "settings": "environment variables that change runs",
-    **{
-        name: f"cache, {name}"
-        for name in ("cache folder", "compiled programs", "numba engine", "figures")
-    },
 }
-_PACKAGES = (
+_PACKAGES = [
     "jax",
     "jaxlib",
     "jax-md",
@@ -33,19 +29,17 @@ _PACKAGES = (
     "netCDF4",
     "gsd",
     "matplotlib",
-)
-_SETTINGS = (
-    "JAX_",
-    "XLA_",
-    "OMP_",
-    "CUDA_VISIBLE_DEVICES",
-)  # first letters of environment variables that change runs
+]
+_SETTINGS = ("JAX_", "XLA_", "OMP_", "CUDA_VISIBLE_DEVICES")  # how such variables begin
 
 
 def run_info_command(json: bool = False) -> None:
     configured_jax()
+    settings = [f"{k}={v}" for k, v in sorted(os.environ.items()) if k.startswith(_SETTINGS)]
+    commit = environment.commit()
     lines = {
-        "jaxgran": environment.versions(["jaxgran"])["jaxgran"] + _commit(),
+        "jaxgran": environment.versions(["jaxgran"])["jaxgran"]
+        + (f", commit {commit}" if commit else ""),
         "python": platform.python_version(),
         **environment.versions(_PACKAGES),
         "platform": f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -55,34 +49,29 @@ def run_info_command(json: bool = False) -> None:
         **_devices(),
         "precision": environment.precision(),
         "ffmpeg": shutil.which("ffmpeg") or "none",
-        "settings": ", ".join(
-            f"{k}={v}" for k, v in sorted(os.environ.items()) if k.startswith(_SETTINGS)
-        )
-        or "none",
-        **_caches(),
+        "settings": ", ".join(settings) or "none",
     }
+    caches = {name: _state(folder) for name, folder in _caches().items()}
     if json:
-        entries = {
-            name: Entry(value, _MEANINGS.get(name, name), None) for name, value in lines.items()
-        }
-        print_json({name.replace(" ", "_"): entry for name, entry in entries.items()})
+        meanings = _MEANINGS | {name: f"cache, {name}" for name in caches}
+        print_json(
+            {
+                name.replace(" ", "_"): Entry(value, meanings.get(name, name), None)
+                for name, value in (lines | caches).items()
+            }
+        )
         return
-    for name, value in lines.items():
+    for name, value in (lines | caches).items():
         print(f"{name:18s} {value}")
 
 
 info_command = command({"json": JSON}, run_info_command)
 
 
-def _commit() -> str:
-    found = environment.commit()
-    return f", commit {found}" if found else ""
-
-
 def _devices() -> dict[str, str]:
     """The devices, and the engine and solver that "auto" takes there."""
     try:
-        found = environment.devices()
+        names = environment.devices()
     except RuntimeError as failure:  # the report is needed most if there is none
         return {"devices": f"none: {failure}", "engine": "none", "solver": "none"}
     from jaxgran.dynamics.engine import DEFAULT_NUMERICS, select_engine, solver_in_use
@@ -91,27 +80,25 @@ def _devices() -> dict[str, str]:
     flow = ShearFlow(grains=256, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
     engine = select_engine(flow, DEFAULT_NUMERICS)
     solver = solver_in_use(engine, DEFAULT_NUMERICS.solver)
-    return {"devices": ", ".join(found), "engine": f"auto takes {engine.name}", "solver": solver}
+    return {"devices": ", ".join(names), "engine": f"auto takes {engine.name}", "solver": solver}
 
 
-def _caches() -> dict[str, str]:
-    """The folders of caches, and whether files can be written there."""
+def _caches() -> dict[str, Path | None]:
     import matplotlib
 
     from jaxgran.dynamics.numba_engine.ffi import object_file
 
-    folders = {
+    return {
         "cache folder": users_folder(),
         "compiled programs": programs_folder(),
         "numba engine": object_file().parent,
         "figures": Path(matplotlib.get_cachedir()),
     }
-    return {
-        name: "none" if folder is None else f"{folder}, {_state(folder)}"
-        for name, folder in folders.items()
-    }
 
 
-def _state(folder: Path) -> str:
+def _state(folder: Path | None) -> str:
+    """A folder, and whether files can be written there."""
+    if folder is None:
+        return "none"
     why = why_unwritable(folder)
-    return f"cannot be written ({why})" if why else "works"
+    return f"{folder}, " + (f"cannot be written ({why})" if why else "works")

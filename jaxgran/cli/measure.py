@@ -16,15 +16,13 @@ from jaxgran.cli.output import Entry, print_table, print_text
 from jaxgran.cli.terminal import (
     BAD_STATUS,
     configured_jax,
+    interrupted_status,
     require_device,
     say,
     say_written,
-    stop,
-    stop_interrupted,
 )
 from jaxgran.maps.interruption import Interrupted
-from jaxgran.maps.settings import options
-from jaxgran.model.checks import refused
+from jaxgran.maps.settings import OPTIONS
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import with_error
 
@@ -61,6 +59,7 @@ def run_map(parameters: Mapping[str, Any], quiet: bool) -> Outcome:
     given: dict[str, Any] = {
         "progress": not quiet,
         "attributes": {"command": command_line()},
+        **parameters,
         **_numerics(parameters),
     }
     output = given.get("output")
@@ -77,25 +76,12 @@ def run_map(parameters: Mapping[str, Any], quiet: bool) -> Outcome:
 
 
 def _numerics(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters with values in place of the names of a solver and an engine."""
+    """Solver and engine in place of their names, where they are given."""
     from jaxgran.contact.projected_methods import SOLVERS
     from jaxgran.dynamics.engine import engine_named
 
-    given = dict(parameters)
-    solver = given.get("solver")
-    if isinstance(solver, str):
-        if (
-            solver not in SOLVERS
-        ):  # of a file, which has the name of a user's class and not the class
-            raise refused(
-                "solver",
-                solver,
-                f"must be {', '.join(SOLVERS)}, or a class that is passed to ratio_map",
-            )
-        given["solver"] = SOLVERS[solver]()
-    if isinstance(given.get("engine"), str):
-        given["engine"] = engine_named(given["engine"])
-    return given
+    made = {"solver": lambda name: SOLVERS[name](), "engine": engine_named}
+    return {name: make(parameters[name]) for name, make in made.items() if name in parameters}
 
 
 def command_line() -> str:
@@ -175,37 +161,47 @@ def _say_errors(data) -> None:
 
 
 def print_large_system(data) -> None:
-    """Print the averages of a large system, and where their errors come from.
-
-    For one point these are values; for a map, the median (largest) change and errors.
+    """Print the averages of a large system, and where their errors come from: the values of a flow,
+    for each number of grains, or the medians of a map and the largest ones.
     """
-    from jaxgran.maps.schema import flattened, relative_ci95
+    from jaxgran.maps.schema import flattened, parts
 
-    shown = flattened(data)
-    if not np.isfinite(shown.force_ratio).any():
-        return
-    point = shown.status.size == 1
+    of_flow = data.sizes["packing_fraction"] * data.sizes["restitution"] == 1
+    shown = [
+        part
+        for part in (parts(data) if of_flow else [flattened(data)])
+        if np.isfinite(part.force_ratio).any()
+    ]
+    for part in shown:
+        _print_large_system(part)
+    if shown:
+        print_text(_SMALLER)
+
+
+def _print_large_system(data) -> None:
+    from jaxgran.maps.schema import relative_ci95
+
+    point = data.status.size == 1
     size = f"N = {data.attrs['grains']}" if "grains" in data.attrs else "its N"
     values = (size, "large system") if point else ("correction", "total")
     title = "Averages of a large system, ± 95 %, and the parts of their errors"
     title += " in %" if point else " in %: median (largest)"
-    if not _are_measured(shown):
-        title += f"\n{shown.pressure_large_system.attrs['comment']}"
+    if not _are_measured(data):
+        title += f"\n{data.pressure_large_system.attrs['comment']}"
     rows = []
-    for name in _PRINTED:
+    for name, words in _PRINTED.items():
         errors = relative_ci95(data, name)
-        at_size, large = shown[name].values, shown[f"{name}_large_system"].values
+        at_size, large = data[name].values, data[f"{name}_large_system"].values
         if point:
-            half = HALF_INTERVAL * shown[f"{name}_stderr"].item()
-            whole = shown[f"{name}_large_system_ci95"].sel(error_source="total").item()
+            half = HALF_INTERVAL * data[f"{name}_stderr"].item()
+            whole = data[f"{name}_large_system_ci95"].sel(error_source="total").item()
             cells = [with_error(at_size.item(), half), with_error(large.item(), whole)]
         else:
             cells = [_percent(large / at_size - 1), _percent(errors["total"])]
-        parts = {source: _percent(errors[source]) for source in _SOURCES}
-        parts |= {"timestep": "–"} if name == "force_ratio" else {}
-        rows.append([_PRINTED[name], *cells, *parts.values()])
+        sources = {source: _percent(errors[source]) for source in _SOURCES}
+        sources |= {"timestep": "–"} if name == "force_ratio" else {}
+        rows.append([words, *cells, *sources.values()])
     print_table(title, ("average", *values, *_SOURCES.values()), rows)
-    print_text(_SMALLER)
 
 
 def _are_measured(data) -> bool:
@@ -248,7 +244,7 @@ def finish(
     bad = bad_points(data)
     short = bad.pop("short_sample", [])
     if short:
-        say(with_options(short_samples_message(data, short), options("map")))
+        say(with_options(short_samples_message(data, short), OPTIONS))
     if interrupted:
         missing = (
             "" if data.status.size == 1 else f" with {len(bad.get('not_run', []))} points missing"
@@ -259,6 +255,8 @@ def finish(
             saved = f"finished points are saved. Continue: {data.attrs['command']}{resume}"
         elif written:
             saved = "finished points are saved."
-        stop_interrupted(f"interrupted{missing}; {saved}")
+        say(f"jaxgran: interrupted{missing}; {saved}")
+        raise SystemExit(interrupted_status())
     if bad:
-        stop(with_options(bad_points_message(data, bad), options("map")), BAD_STATUS)
+        say(f"jaxgran: {with_options(bad_points_message(data, bad), OPTIONS)}")
+        raise SystemExit(BAD_STATUS)

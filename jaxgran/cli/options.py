@@ -1,14 +1,12 @@
-"""The options of a command, from its table: their help texts, their values from text, and what is
-wrong with them.
-
-Typer sees texts, flags and paths only. Numbers, lists and choices are read here, so every mistake
-is an ``InputError``, on the command line as in Python.
+"""The options of a command, from its table: what Typer shows and reads, and what is wrong with a
+value, in terms of options.
 """
 
 import inspect
 import re
 from collections.abc import Callable, Container, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,14 +15,15 @@ import typer
 from jaxgran.cli.terminal import run_command
 from jaxgran.maps.options import Command, Option
 from jaxgran.maps.presets import PRESETS
-from jaxgran.maps.settings import DEFAULTS, is_new_dimension, options
-from jaxgran.model.checks import InputError, refused, require
+from jaxgran.maps.settings import DEFAULTS, OPTIONS, is_new_dimension, options
+from jaxgran.model.checks import InputError
 from jaxgran.model.choices import MAX_REPLICAS
 
 _PARAMETER = re.compile(r"`(\w+)(?:='?(\w+)'?)?`")  # in an InputError
-_MOST_DIGITS = 20  # of a whole number
-_LIST = f"or a list like 0.1,0.5,0.9 or start:stop:count with a count of 2 to {MAX_REPLICAS}"
-_WHOLE_LIST = "or a list like 256,1000,4000"
+_LISTS = {
+    int: "a list like 256,1000,4000",
+    float: f"a list like 0.1,0.5,0.9 or start:stop:count with a count of 2 to {MAX_REPLICAS}",
+}
 FILE = Option("Dataset of a map.", Path)
 QUIET = Option("Say on standard error what went wrong only.", bool, short="q")
 OVERWRITE = Option("Replace the output, whatever it holds.", bool)
@@ -32,21 +31,21 @@ OVERWRITE = Option("Replace the output, whatever it holds.", bool)
 
 def of_map(command: Command) -> dict[str, Option]:
     """The parameters of a map that a command offers, with the defaults of the command."""
-    return {name: _as_offered(name, one, command) for name, one in options(command).items()}
+    return {name: _as_offered(name, row, command) for name, row in options(command).items()}
 
 
-def _as_offered(name: str, one: Option, command: Command) -> Option:
-    start, text = DEFAULTS[name], one.default
+def _as_offered(name: str, row: Option, command: Command) -> Option:
+    start, text = DEFAULTS[name], row.default
     if command == "run" and name in ("restitution", "packing_fraction"):
         text = None
     elif command == "map" and name in PRESETS["quick"]:
         text = "of the preset"
-    elif text is None and one.kind is not bool and start is not None:
+    elif text is None and row.kind is not bool and start is not None:
         text = f"{start:g}" if isinstance(start, float) else str(start)
     if command == "run":
-        return replace(one, default=text, several=False)
+        return replace(row, default=text, several=name == "grains")
     words = " A list adds a dimension." if is_new_dimension(name) else ""
-    return replace(one, default=text, help=one.help + words)
+    return replace(row, default=text, help=row.help + words)
 
 
 def command(
@@ -67,87 +66,73 @@ def command(
       several: whether several such files are given.
     """
 
-    def parsed(**texts: Any) -> None:
-        file = () if argument is None else (texts.pop(place),)
-        given = {name: text for name, text in texts.items() if text is not None}
+    def parsed(**values: Any) -> None:
+        files = () if argument is None else (values.pop("file"),)
+        given = {name: value for name, value in values.items() if value is not None}
+        run_command(partial(run, *files, **given), lambda mistake: sentence_of(mistake, table))
 
-        def values_and_run() -> None:
-            run(*file, **{name: value(name, table[name], text) for name, text in given.items()})
-
-        run_command(values_and_run, lambda mistake: sentence_of(mistake, table))
-
-    place, kind = ("files", list[Path]) if several else ("file", Path)
     parameters = []
     if argument is not None:
         words = argument.help + (f" [default: {argument.default}]" if argument.default else "")
-        declared = typer.Argument(help=words, show_default=False)
-        parameters.append(_parameter(place, kind, declared, not argument.default))
-    for name, one in table.items():
-        kind = one.kind if one.kind in (bool, Path) else str
-        parameters.append(_parameter(name, kind, _declared(name, one), name in required))
+        metavar = "FILE..." if several else "FILE"
+        shown = typer.Argument(help=words, show_default=False, metavar=metavar)
+        kind = list[Path] if several else Path
+        parameters.append(_parameter("file", kind, shown, not argument.default))
+    for name, row in table.items():
+        kind, declared = _declared(name, row)
+        parameters.append(_parameter(name, kind, declared, name in required))
     parsed.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return parsed
 
 
 def _parameter(name: str, kind: Any, declared: Any, required: bool) -> inspect.Parameter:
-    start = inspect.Parameter.empty if required else None
-    annotation = Annotated[kind if required else kind | None, declared]
     return inspect.Parameter(
-        name, inspect.Parameter.KEYWORD_ONLY, default=start, annotation=annotation
+        name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=inspect.Parameter.empty if required else None,
+        annotation=Annotated[kind if required else kind | None, declared],
     )
 
 
-def _declared(name: str, one: Option) -> Any:
-    """The option as Typer knows it."""
-    off = f"/--no-{name}" if one.off else ""
-    names = [option_name(name) + off, *([f"-{one.short}"] if one.short else [])]
-    words = with_options(one.help, (*options("map"), *options("run")))
-    words += f" [unit: {one.unit}]" if one.unit else ""
-    words += f" [default: {one.default}]" if one.default else ""
-    choices = one.kind if isinstance(one.kind, tuple) else ("auto",) if one.auto else ()
-    completion = (lambda: list(choices)) if choices else None
-    metavar = None if one.kind is bool else one.placeholder
-    return typer.Option(
-        *names, help=words, metavar=metavar, show_default=False, autocompletion=completion
-    )
+def _declared(name: str, row: Option) -> tuple[Any, Any]:
+    """The type of an option, and the option itself, as Typer knows them."""
+    names = [option_name(name) + (f"/--no-{name}" if row.off else "")]
+    names += [f"-{row.short}"] if row.short else []
+    words = with_options(row.help, OPTIONS)
+    words += f" [unit: {row.unit}]" if row.unit else ""
+    words += f" [default: {row.default}]" if row.default else ""
+    option = partial(typer.Option, *names, help=words, show_default=False)
+    if row.kind is bool:
+        return bool, option()
+    choices = list(row.kind) if isinstance(row.kind, tuple) else ["auto"] if row.auto else []
+    option = partial(option, metavar=row.placeholder, autocompletion=lambda: choices)
+    if row.kind in (Path, str):
+        return row.kind, option()
+    return str, option(parser=partial(parse, name, row))
 
 
-def value(name: str, one: Option, text: Any) -> Any:
-    """The value of an option from its text.
-
-    Raises:
-      InputError: (a ValueError) it is not accepted; ``field`` is the name.
-    """
-    if not isinstance(text, str) or one.kind is str:
+def parse(name: str, row: Option, text: str) -> Any:
+    """A number, a tuple of numbers or a word; a mistake is one of Typer's, in our words."""
+    choices = row.kind if isinstance(row.kind, tuple) else ("auto",) if row.auto else ()
+    if text in choices:
         return text
-    if isinstance(one.kind, tuple):
-        if text not in one.kind:
-            raise refused(name, text, f"must be {', '.join(one.kind[:-1])} or {one.kind[-1]}")
-        return text
-    if one.auto and text == "auto":
-        return text
-    several = (_WHOLE_LIST if one.kind is int else _LIST) if one.several or one.values else ""
-    auto = "" if not one.auto else "auto, " if several else "auto or "
-    accepted = f"{auto}{'a whole number' if one.kind is int else 'a number'} {several}".strip()
+    several = row.several or row.values
     try:
-        numbers = list(_whole(text) if one.kind is int else _numbers(text))
-        if len(numbers) > 1 and not (one.several or one.values):
+        if isinstance(row.kind, tuple):
+            raise ValueError(text)
+        numbers = list(map(int, text.split(",")) if row.kind is int else _numbers(text))
+        if len(numbers) > 1 and not several:
             raise ValueError(text)
     except ValueError:
-        raise refused(name, text, f"must be {accepted}") from None
-    if one.range is not None:
-        for number in numbers:
-            accepts, words = one.range
-            require(name, number, accepts, ("auto or " if one.auto else "") + words)
-    is_list = one.values or (one.several and not is_new_dimension(name))
+        accepted = list(choices)
+        if not isinstance(row.kind, tuple):
+            accepted += ["a whole number" if row.kind is int else "a number"]
+            accepted += [_LISTS[row.kind]] if several else []
+        *others, last = accepted
+        words = f"{', '.join(others)} or {last}" if others else last
+        raise typer.BadParameter(f"must be {words}, not {text!r}.") from None
+    is_list = row.values or (row.several and not is_new_dimension(name))
     return tuple(numbers) if len(numbers) > 1 or is_list else numbers[0]
-
-
-def _whole(text: str) -> tuple[int, ...]:
-    parts = text.split(",")
-    if not all(part.removeprefix("-").isdecimal() and len(part) <= _MOST_DIGITS for part in parts):
-        raise ValueError(text)
-    return tuple(int(part) for part in parts)
 
 
 def _numbers(text: str) -> tuple[float, ...]:
@@ -155,19 +140,15 @@ def _numbers(text: str) -> tuple[float, ...]:
     if ":" not in text:
         return tuple(float(x) for x in text.split(","))
     start, stop, count = text.split(":")
-    steps = int(count) - 1
+    first, gap, steps = float(start), float(stop) - float(start), int(count) - 1
     if not 1 <= steps < MAX_REPLICAS:
         raise ValueError(count)
-    return tuple(
-        round(float(start) + (float(stop) - float(start)) * k / steps, 12) for k in range(steps + 1)
-    )
+    return tuple(round(first + gap * k / steps, 12) for k in range(steps + 1))
 
 
 def examples(commands: Mapping[str, str]) -> str:
     """The end of a help text: example commands and what they do."""
-    lines = [
-        line for purpose, line in commands.items() for line in (f"  {purpose}:", f"    {line}")
-    ]
+    lines = [f"  {purpose}:\n    {line}" for purpose, line in commands.items()]
     return "\b\n" + "\n".join(["Examples:", *lines])
 
 

@@ -36,9 +36,13 @@ _IN_ASCII = str.maketrans(
 )
 
 
+def _console() -> Console:
+    return Console(highlight=False, markup=False, emoji=False)
+
+
 def print_text(text: str) -> None:
     """Print sentences in lines that fit the terminal."""
-    Console(highlight=False, markup=False, emoji=False).print(_letters(text))
+    _console().print(_letters(text))
 
 
 def print_table(
@@ -48,7 +52,7 @@ def print_table(
 
     All columns but the first are right-aligned, or left-aligned if ``numbers`` is False.
     """
-    console = Console(highlight=False, markup=False, emoji=False)
+    console = _console()
     table = Table(box=box.SIMPLE, header_style="")
     lines = [list(map(_letters, row)) for row in rows]
     longest_word = max((len(word) for line in lines for word in line[0].split()), default=0)

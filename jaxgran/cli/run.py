@@ -5,12 +5,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from jaxgran.cli.measure import entries, finish, print_large_system, run_map
 from jaxgran.cli.options import QUIET, command, of_map
 from jaxgran.cli.output import JSON, print_json, print_table
-from jaxgran.cli.terminal import configured_jax, counted, say
+from jaxgran.cli.terminal import configured_jax, say, with_progress
 from jaxgran.io.paths import require_absent
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, require_number
@@ -21,12 +21,8 @@ _RECORDED_STRAIN = 5.0  # sampled strain where frames are recorded and none is g
 
 _PHYSICS = (  # what is printed without --all, with the shear-stress ratio below the first
     *("force_ratio", "pressure", "shear_stress", "macroscopic_friction", "inertial_number"),
-    *(
-        "granular_temperature",
-        "local_granular_temperature",
-        "coordination_number",
-        "collision_rate",
-    ),
+    *("granular_temperature", "local_granular_temperature"),
+    *("coordination_number", "collision_rate"),
 )
 
 RUN_EXAMPLES = {
@@ -42,8 +38,7 @@ RUN_EXAMPLES = {
 RUN_OPTIONS = {
     **of_map("run"),
     "trajectory": Option(
-        "GSD file of the flow, frame by frame. Recording frames splits the run at different steps, "
-        "so averages change within their errors.",
+        "GSD file of the flow, frame by frame.",
         Path,
         example="FILE.gsd",
     ),
@@ -68,15 +63,9 @@ RUN_OPTIONS["strain"] = replace(
     RUN_OPTIONS["strain"], default=f"{RUN_OPTIONS['strain'].default}; 5 with frames"
 )
 RUN_OPTIONS["seeds"] = replace(RUN_OPTIONS["seeds"], default="1")
-
-
-class FrameFiles(NamedTuple):
-    """The files of frames that were asked for."""
-
-    trajectory: Path | None
-    movie: Path | None
-    frame_strain: float | None
-    force_strain: float | None
+RUN_OPTIONS["grains"] = replace(
+    RUN_OPTIONS["grains"], help=f"{RUN_OPTIONS['grains'].help} A list adds columns."
+)
 
 
 def run_run_command(
@@ -91,19 +80,27 @@ def run_run_command(
     quiet: bool = False,
     **given: Any,
 ) -> None:
-    files = FrameFiles(trajectory, movie, frame_strain, force_strain)
-    chosen = _settled(files, given)
-    recorder, film = _recorder(files, chosen.get("strain", _RECORDED_STRAIN))
-    record = None if recorder is None else recorder.recording
+    chosen = {"seeds": 1, **given}
+    named = {"trajectory": trajectory, "movie": movie}
+    files = {name: file for name, file in named.items() if file is not None}
+    recorder = film = record = None
+    if files:
+        chosen = _recorded(files, chosen)
+        strain = chosen.get("strain", _RECORDED_STRAIN)
+        recorder, film = _recorder(files, strain, frame_strain, force_strain)
+        record = recorder.recording
+    elif frame_strain is not None or force_strain is not None:
+        name = "force_strain" if frame_strain is None else "frame_strain"
+        raise InputError(f"`{name}` requires `trajectory` or `movie`.", field=name)
     plane = {"restitution": (restitution,), "packing_fraction": (packing_fraction,)}
     data, interrupted, written = run_map({**plane, **chosen, "record": record}, quiet)
-    if json:
-        print_json(entries(data.isel(packing_fraction=0, restitution=0)))
-    elif bool(data.force_ratio.notnull().any()):
+    if not json and bool(data.force_ratio.notnull().any()):
         _print_averages(data, all)
         print_large_system(data)
     if recorder is not None and recorder.frames:
         _write_frames(files, recorder.frames, film, quiet)
+    if json:
+        print_json(entries(data.isel(packing_fraction=0, restitution=0)))
     output = chosen.get("output")
     finish(data, [output] if output is not None and written else [], interrupted, quiet, output)
 
@@ -111,121 +108,117 @@ def run_run_command(
 run_command = command(RUN_OPTIONS, run_run_command, required=("restitution", "packing_fraction"))
 
 
-def _settled(files: FrameFiles, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters of the flow: one seed, and a short strain where frames are recorded."""
-    chosen = {"seeds": 1, **given}
-    named = {"trajectory": files.trajectory, "movie": files.movie}
-    if any(named.values()) and chosen["seeds"] > 1:
-        raise InputError(
-            "`trajectory` and `movie` show one seed: leave out `seeds`.", field="seeds"
-        )
-    if any(named.values()) and "error" not in chosen:
-        chosen.setdefault("strain", _RECORDED_STRAIN)
-    for name, file in named.items():
-        if file is not None and not chosen.get("overwrite"):
+def _recorded(files: Mapping[str, Path], chosen: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of a flow whose frames are recorded, with a short strain where none is
+    given.
+    """
+    several = {"seeds": chosen["seeds"] > 1, "grains": isinstance(chosen.get("grains"), tuple)}
+    for name in (name for name, true in several.items() if true):
+        reason = f"`trajectory` and `movie` show one flow of one seed: leave out `{name}`."
+        raise InputError(reason, field=name)
+    if not chosen.get("overwrite"):
+        for name, file in files.items():
             require_absent(file, name)
-    return chosen
+    return dict(chosen) if "error" in chosen else {"strain": _RECORDED_STRAIN, **chosen}
 
 
-def _recorder(files: FrameFiles, strain: float):
-    """The recorder of the flow and the frames of its movie; None if there is no file for it."""
-    if files.trajectory is None and files.movie is None:
-        for name in ("frame_strain", "force_strain"):
-            if getattr(files, name) is not None:
-                raise InputError(f"`{name}` requires `trajectory` or `movie`.", field=name)
-        return None, None
+def _recorder(
+    files: Mapping[str, Path], strain: float, every: float | None, force_strain: float | None
+) -> tuple[Any, Any]:
+    """The recorder of the flow, and the frames of its movie."""
     configured_jax()
     from jaxgran.io.trajectory import check_trajectory, write_frame
     from jaxgran.plotting.movie import MOST_DRAWN, Frames, check_movie
     from jaxgran.sampling.recorder import Recorder
 
-    every = strain / 100
-    if files.frame_strain is not None:
-        most = MOST_RECORDED if files.movie is None else MOST_DRAWN
-        accepted = (
-            f"at least {strain / most:g}, for {most} frames, and at most the sampled strain, "
-            f"{strain:g}"
-        )
-        every = files.frame_strain
-        require_number(
-            "frame_strain", every, lambda x: (x >= 0.99 * strain / most) & (x <= strain), accepted
-        )
-    if files.force_strain is not None:
-        accepted = f"above 0 and at most the strain between frames, {every:g}"
-        require_number(
-            "force_strain", files.force_strain, lambda x: (x > 0) & (x <= every), accepted
-        )
+    most = MOST_DRAWN if "movie" in files else MOST_RECORDED
+    least, between = strain / most, strain / 100 if every is None else every
+    accepted = f"at least {least:g}, for {most} frames, and at most the sampled strain, {strain:g}"
+    require_number("frame_strain", between, lambda x: (x >= 0.99 * least) & (x <= strain), accepted)
+    if force_strain is not None:
+        accepted = f"above 0 and at most the strain between frames, {between:g}"
+        require_number("force_strain", force_strain, lambda x: (x > 0) & (x <= between), accepted)
     keep, film = [], Frames()
-    if files.trajectory is not None:
-        check_trajectory(files.trajectory)
-        keep.append(partial(write_frame, files.trajectory))
-    if files.movie is not None:
-        check_movie(files.movie)
+    if "trajectory" in files:
+        check_trajectory(files["trajectory"])
+        keep.append(partial(write_frame, files["trajectory"]))
+    if "movie" in files:
+        check_movie(files["movie"])
         keep.append(film.keep)
-    return Recorder(every, *keep, force_strain=files.force_strain or 0.0), film
+    return Recorder(between, *keep, force_strain=force_strain or 0.0), film
 
 
-def _write_frames(files: FrameFiles, frames: int, film, quiet: bool) -> None:
-    """Draw the movie, with progress unless quiet, and say what was written."""
+def _write_frames(files: Mapping[str, Path], frames: int, film: Any, quiet: bool) -> None:
+    """Draw the movie, and say what was written."""
     from jaxgran.plotting.movie import write_movie
 
-    say(
-        "recording frames split the run at different steps, so averages change within their errors."
-    )
-    if files.trajectory is not None:
-        say(f"wrote {files.trajectory}: {frames} frames")
-    if files.movie is not None:
-        if not quiet:
-            say(f"drawing {len(film)} frames")
-        follow = iter if quiet else partial(counted, words="frames")
-        write_movie(files.movie, film, follow=follow)
-        say(f"wrote {files.movie}: {len(film)} frames")
+    if "movie" in files:
+        write_movie(files["movie"], film, follow=iter if quiet else with_progress)
+    if not quiet:
+        say("recording splits the run at different steps: averages change within their errors.")
+        for name, file in files.items():
+            say(f"wrote {file}: {frames if name == 'trajectory' else len(film)} frames")
 
 
 def _print_averages(data, all: bool) -> None:
-    """Print the averages of one flow with errors, units, effective sample sizes and predictions of
-    kinetic theory.
+    """Print the averages with errors, a column for each number of grains; for one of them also
+    effective sample sizes and predictions of kinetic theory.
     """
-    from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
+    from jaxgran.maps.schema import parts
+
+    points = [part.isel(packing_fraction=0, restitution=0) for part in parts(data)]
+    sizes = [f"N = {point.attrs['grains']}" for point in points]
+    title = (
+        f"{', '.join(sizes)}; dt = {data.attrs['timestep']:g} / shear rate, "
+        f"{data.attrs['activation']} activation\n"
+        f"engine {data.attrs['engine']}, solver {data.attrs['solver']}"
+    )
+    tables = [_rows(point, all) for point in points]
+    if len(tables) == 1:
+        columns = ("observable", "value ±\nstandard error", "unit", "effective\nsamples")
+        print_table(title, (*columns, "kinetic\ntheory"), tables[0], numbers=False)
+        return
+    rows = [
+        same[0] if len(same[0]) == 1 else [same[0][0], same[0][2], *(row[1] for row in same)]
+        for same in zip(*tables, strict=True)
+    ]
+    columns = ("observable", "unit", *(f"{size} ±\nstandard error" for size in sizes))
+    print_table(title, columns, rows, numbers=False)
+
+
+def _rows(point, all: bool) -> list[list[str]]:
+    """Name, value with error, unit, effective samples and kinetic theory of each average; a name
+    alone is the heading of a group.
+    """
+    from jaxgran.maps.schema import path_of, shear_stress_ratio
     from jaxgran.sampling.enskog_factors import LENGTHS
     from jaxgran.sampling.observables import GROUPS, OBSERVABLES
 
-    grains, timestep, rule = (data.attrs[name] for name in ("grains", "timestep", "activation"))
-    title = (
-        f"{grains} grains, dt = {timestep:g} / shear rate, {rule} activation\n"
-        f"engine {data.attrs['engine']}, solver {data.attrs['solver']}"
-    )
-    columns = (
-        "observable",
-        "value ±\nstandard error",
-        "unit",
-        "effective\nsamples",
-        "kinetic\ntheory",
-    )
-    rows: list[list[str]] = []
-    point = flattened(data).isel(packing_fraction=0, restitution=0)
     strain = float(point["sums/strain"].sum())
     correlated = point["diagnostics/correlation_strain"].to_series().to_dict()
 
     def number(name: str) -> float:
         return float(point[name]) if name in point else math.nan
 
+    def measured(path: str) -> str:
+        return with_error(number(path), number(f"{path}_stderr"))
+
+    rows: list[list[str]] = []
     for group, names in (GROUPS if all else {"/": _PHYSICS}).items():
         rows += [] if group == "/" else [[group.capitalize()]]
         for name in names:
             if OBSERVABLES[name].tensor:
                 continue
-            value, error = number(path_of(name)), number(f"{path_of(name)}_stderr")
-            value = with_error(value, error) if group != "diagnostics" else f"{value:.3g}"
-            samples = strain / correlated.get(name, math.nan)
-            theory = number(f"theory/{name}")
-            texts = ["" if math.isnan(x) else f"{x:.3g}" for x in (samples, theory)]
-            rows.append([name.replace("_", " "), value, unit_text(OBSERVABLES[name].unit), *texts])
+            path, unit = path_of(name), unit_text(OBSERVABLES[name].unit)
+            value = f"{number(path):.3g}" if group == "diagnostics" else measured(path)
+            known = strain / correlated.get(name, math.nan), number(f"theory/{name}")
+            texts = ["" if math.isnan(x) else f"{x:.3g}" for x in known]
+            rows.append([name.replace("_", " "), value, unit, *texts])
             if name == "force_ratio":
                 ratio = with_error(*map(float, shear_stress_ratio(point)))
                 rows.append(["shear-stress ratio", ratio, "", "", ""])
             if name == "binary_dissipation_rate":
-                for length in (f"theory/{name}" for name in LENGTHS):
-                    value = with_error(number(length), number(f"{length}_stderr"))
-                    rows.append([length[7:].replace("_", " "), value, unit_text("sigma"), "", ""])
-    print_table(title, columns, rows, numbers=False)
+                for length in LENGTHS:
+                    words = length.replace("_", " ")
+                    rows.append([words, measured(f"theory/{length}"), "σ", "", ""])
+    return rows

@@ -17,12 +17,15 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+import typer
+
 from jaxgran.cache.folder import cache_folder, fallback_message, use_cache
+from jaxgran.cli.output import Entry, print_json
 from jaxgran.environment import devices
 from jaxgran.maps.interruption import is_interruption
 from jaxgran.model.checks import InputError, short_repr
@@ -34,6 +37,7 @@ INTERRUPTED = 130
 TERMINATED = 143
 
 _T = TypeVar("_T")
+_UsageError: Any = typer.BadParameter.__base__  # of Typer, which does not export it
 
 
 def run_command(command: Callable[[], None], sentence: Callable[[Any], str]) -> None:
@@ -47,13 +51,13 @@ def run_command(command: Callable[[], None], sentence: Callable[[Any], str]) -> 
     except InputError as mistake:
         stop(sentence(mistake))
     except (SystemExit, BrokenPipeError):
-        raise  # Typer ends a command whose reader has gone
+        raise
     except OSError as error:
         stop(_of_file(error, sentence), NO_FILE)
     except BaseException as error:
         if not is_interruption(error):
             raise
-        stop_interrupted("interrupted.")
+        stop("interrupted.", interrupted_status())
     finally:
         signal.signal(signal.SIGTERM, before)
 
@@ -65,21 +69,29 @@ def _of_file(error: OSError, sentence: Callable[[Any], str] = str) -> str:
     return f"stopped{cause} {error.strerror or error}{file}{notes}."
 
 
+def exit_status(app: Callable[..., Any]) -> int:
+    """Run the program, and return its exit status."""
+    try:
+        return app(prog_name="jaxgran", standalone_mode=False) or 0
+    except _UsageError as mistake:
+        mistake.show()
+        _print_json_error(mistake.format_message())
+        return INPUT_MISTAKE
+    except SystemExit as end:
+        return int(end.code or 0)
+
+
 def run_program(app: Callable[..., Any]) -> NoReturn:
     """Run the program, and end its process."""
-    status = 0
+    status = NO_FILE
     try:
-        try:
-            app(prog_name="jaxgran")
-        finally:
-            sys.stdout.flush()  # a full disk fails here, and not when Python ends
+        status = exit_status(app)
+        sys.stdout.flush()  # a full disk fails here, and not when Python ends
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python fails as it ends
         if not isinstance(error, BrokenPipeError):
             say(f"jaxgran: {_of_file(error)}")
         status = NO_FILE
-    except SystemExit as end:
-        status = int(end.code or 0)
     _end_without_threads(status)
     raise SystemExit(status)
 
@@ -121,14 +133,21 @@ def say_written(paths: Iterable[Path]) -> None:
 
 
 def stop(sentence: str, status: int = INPUT_MISTAKE) -> NoReturn:
-    """Print why the command ends, and exit with the status."""
+    """Print why the command ends without a result, and exit with the status."""
     say(f"jaxgran: {sentence}")
+    _print_json_error(sentence)
     raise SystemExit(status)
 
 
-def stop_interrupted(sentence: str) -> NoReturn:
-    """Print that the command was interrupted, and exit with the status of the signal."""
-    stop(sentence, TERMINATED if _Terminated.now else INTERRUPTED)
+def _print_json_error(sentence: str) -> None:
+    """Print an error as the object that was asked for."""
+    if "--json" in sys.argv:
+        print_json({"error": Entry(sentence, "why there is no result", None)})
+
+
+def interrupted_status() -> int:
+    """The exit status of the signal that interrupted the command."""
+    return TERMINATED if _Terminated.now else INTERRUPTED
 
 
 def configured_jax():
@@ -164,12 +183,10 @@ def _say_cache() -> None:
         os.environ.setdefault("MPLCONFIGDIR", str(folder / "matplotlib"))
 
 
-def counted(items: Sequence[_T], words: str) -> Iterator[_T]:
-    """The items one by one, with a progress bar on a terminal; ``words`` is its title."""
+def with_progress(frames: Sequence[_T]) -> Iterable[_T]:
+    """The frames of a movie one by one, with a progress bar on a terminal."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import track
 
     console = Console(stderr=True)
-    columns = TextColumn(words), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        yield from bar.track(items)
+    return track(frames, "drawing", console=console, disable=not console.is_terminal)

@@ -1,9 +1,18 @@
 """The command ``where``: what kinetic theory can predict in a flow, without a simulation."""
 
-from jaxgran.cli.options import command
+import csv as comma_separated
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxgran.cli.options import OVERWRITE, command
 from jaxgran.cli.output import JSON, Entry, print_json, print_table, print_text
+from jaxgran.cli.terminal import say_written
 from jaxgran.maps.options import Option
-from jaxgran.model.display import with_error
+from jaxgran.model.checks import InputError
+from jaxgran.model.display import in_brackets, with_error
 from jaxgran.reference.table import MEASURED, THEORIES, shipped_table
 from jaxgran.reference.validity import COLUMNS, Validity, validity
 
@@ -12,13 +21,27 @@ WHERE_EXAMPLES = {
     "--restitution 0.5 --packing-fraction 0.7",
     "And which of its assumptions fails": "jaxgran where --restitution 0.5 --packing-fraction 0.7 "
     "--factors",
+    "Every pair of two lists, as a table": "jaxgran where --restitution 0.2,0.5,0.8 "
+    "--packing-fraction 0.5:0.8:4",
+    "The constitutive law over the whole range": "jaxgran where --law law.csv",
 }
 WHERE_OPTIONS = {
-    "restitution": Option("Coefficient of restitution α, in the range of the reference map."),
-    "packing_fraction": Option("Packing fraction ν, in the range of the reference map."),
+    "restitution": Option(
+        "Coefficient of restitution α, in the range of the reference map.", several=True
+    ),
+    "packing_fraction": Option(
+        "Packing fraction ν, in the range of the reference map.", several=True
+    ),
     "factors": Option("Print how far every assumption of the theory is off.", bool),
     "corrected": Option("Print also the theory with measured correlations.", bool),
+    "csv": Option("Print a line of CSV for each pair, with the names of --json.", bool),
     "json": JSON,
+    "law": Option(
+        "File of the constitutive law, at the given values or over the range of the map.",
+        Path,
+        example="FILE.csv",
+    ),
+    "overwrite": OVERWRITE,
 }
 _UNITS = MEASURED | {"force_ratio": "1"}
 _ASSUMPTIONS = {
@@ -28,33 +51,113 @@ _ASSUMPTIONS = {
     "pairs": "pairs at contact are those of equilibrium",
     "binary": "collisions are binary",
 }
+_FACTORS = "Enskog's contact pressure at the measured granular temperature"
 
 
 def run_where_command(
-    restitution: float,
-    packing_fraction: float,
+    restitution: Sequence[float] | None = None,
+    packing_fraction: Sequence[float] | None = None,
     factors: bool = False,
     corrected: bool = False,
+    csv: bool = False,
     json: bool = False,
+    law: Path | None = None,
+    overwrite: bool = False,
 ) -> None:
-    flow = validity(restitution, packing_fraction)
-    if json:
-        print_json(_entries(flow))
+    if csv and json:
+        raise InputError("`csv` and `json` exclude each other.", field="csv")
+    if law is not None:
+        from jaxgran.io.paths import require_place
+        from jaxgran.reference.law import constitutive_law
+
+        require_place(law, "law", ".csv")
+        constitutive_law().to_csv(law, restitution, packing_fraction, overwrite)
+        say_written([law])
+    if restitution is None or packing_fraction is None:
+        if law is None:
+            raise InputError("`restitution` and `packing_fraction` are required, or `law`.")
         return
+    plane = np.meshgrid(restitution, packing_fraction)
+    is_point = plane[0].size == 1
+    flow = validity(*(x.item() if is_point else x for x in plane))
+    if csv:
+        _print_csv(_entries(flow))
+    elif json:
+        axes = {"restitution": restitution, "packing_fraction": packing_fraction}
+        entries = _entries(flow)
+        entries |= {
+            name: entries[name]._replace(value=values[0] if is_point else values)
+            for name, values in axes.items()
+        }
+        print_json(entries)
+    elif is_point:
+        _print_point(flow, factors, corrected)
+    else:
+        _print_plane(flow, factors, corrected)
+
+
+def _print_point(flow: Validity, factors: bool, corrected: bool) -> None:
     print_text(flow.verdict())
     columns = len(COLUMNS) if corrected else len(COLUMNS) - 1
-    about = f"α = {restitution:g}, ν = {packing_fraction:g}; ± 95 %; units of m, σ and 1/γ̇"
+    pair = f"α = {flow.restitution:g}, ν = {flow.packing_fraction:g}"
+    about = f"{pair}; ± 95 %; units of m, σ and 1/γ̇"
     print_table(about, COLUMNS[:columns], (row[:columns] for row in flow.rows()))
     if factors:
-        rows = (
-            (words, with_error(float(flow.factors[name]), float(flow.factors_ci95[name])))
-            for name, words in _ASSUMPTIONS.items()
-        )
-        assumed = "Enskog's contact pressure at the measured granular temperature"
-        print_table(assumed, ("assumed", "factor if measured instead"), rows)
+        rows = zip(_ASSUMPTIONS.values(), _factors(flow, with_error), strict=True)
+        print_table(_FACTORS, ("assumed", "factor if measured instead"), rows)
+    _print_source()
+
+
+def _print_plane(flow: Validity, factors: bool, corrected: bool) -> None:
+    rows, factor_rows = [], []
+    for place in np.ndindex(flow.restitution.shape):
+        point = flow.at(place)
+        pair = [f"{point.restitution:g}", f"{point.packing_fraction:g}"]
+        averages = [
+            in_brackets(float(point.measured[name]), float(point.measured_ci95[name]))
+            for name in ("force_ratio", "pressure")
+        ]
+        errors = [(point.error, point.error_ci95)]
+        errors += [(point.corrected_error, point.corrected_error_ci95)] if corrected else []
+        percents = [
+            in_brackets(100 * float(error["pressure"]), 100 * float(ci95["pressure"]))
+            for error, ci95 in errors
+        ]
+        rows.append([*pair, *averages, *percents, point.fails_first().replace("_", " ")])
+        factor_rows.append([*pair, *_factors(point, in_brackets)])
+    about = "In brackets: 95 % half-width of the last digits"
+    names = ("error in %", "if corrected")[: 1 + corrected]
+    columns = ("α", "ν", "force ratio", "pressure", *names, "fails first")
+    print_table(f"Error of kinetic theory in the pressure. {about}.", columns, rows)
+    if factors:
+        names = (name.replace("_", " ") for name in _ASSUMPTIONS)
+        print_table(f"Factors of {_FACTORS}. {about}.", ("α", "ν", *names), factor_rows)
+    _print_source()
+
+
+def _factors(flow: Validity, text: Callable[[float, float], str]) -> list[str]:
+    """The factor of every assumption, with its interval."""
+    return [text(float(flow.factors[x]), float(flow.factors_ci95[x])) for x in _ASSUMPTIONS]
+
+
+def _print_source() -> None:
     table = shipped_table()
     theory = THEORIES[table.head["theory"]]
     print_text(f"Reference map: {table.made_with}. Kinetic theory: {theory}.")
+
+
+def _print_csv(entries: dict[str, Entry]) -> None:
+    """Print a line for each pair, with the columns NAME and, where there is one, NAME_ci95."""
+    columns = {}
+    for name, entry in entries.items():
+        columns[name] = entry.value
+        if entry.ci95 is not None:
+            columns[f"{name}_ci95"] = entry.ci95
+    columns["verdict"] = columns.pop("verdict")  # last, as it is long
+    lines = np.broadcast_arrays(*columns.values())
+    writer = comma_separated.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(x.ravel().tolist() for x in lines), strict=True))
 
 
 def _entries(flow: Validity) -> dict[str, Entry]:
@@ -95,4 +198,4 @@ def _entries(flow: Validity) -> dict[str, Entry]:
     return entries
 
 
-where_command = command(WHERE_OPTIONS, run_where_command, ("restitution", "packing_fraction"))
+where_command = command(WHERE_OPTIONS, run_where_command)

@@ -171,7 +171,8 @@ def _check_timesteps(settings: MapSettings, flows: ShearFlow) -> None:
     if excess[worst] > 1:
         most = two_digits(limits[worst], up=False)
         reason = f"must be at most {most} at {point_text(flows, worst)} to avoid deep overlaps"
-        raise refused("timestep", float(np.asarray(flows.timestep)[worst]), f"{reason}, or auto")
+        reason += ", which is safe for all points, or auto" if len(limits) > 1 else ", or auto"
+        raise refused("timestep", float(np.asarray(flows.timestep)[worst]), reason)
     if round(strain / longest) < FEWEST_STEPS:
         least = f"{FEWEST_STEPS} time steps, that is {FEWEST_STEPS * longest:g}"
         raise refused("strain", strain, f"must be at least {least}")

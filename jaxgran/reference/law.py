@@ -13,6 +13,7 @@ from jax.tree_util import register_static
 
 import jaxgran
 from jaxgran.files import atomic_write
+from jaxgran.io.paths import require_absent
 from jaxgran.model.checks import as_array, require
 from jaxgran.model.display import text_of
 from jaxgran.reference.evaluation import PLANE, estimates, module_of, over_range
@@ -158,7 +159,11 @@ class ConstitutiveLaw:
         }
 
     def to_csv(
-        self, path: str | Path, restitution: Any = None, packing_fraction: Any = None
+        self,
+        path: str | Path,
+        restitution: Any = None,
+        packing_fraction: Any = None,
+        overwrite: bool = False,
     ) -> None:
         """Write the law as a table, for programs in other languages.
 
@@ -167,13 +172,16 @@ class ConstitutiveLaw:
         pair of α and ν.
 
         Args:
-          path: file to write; an existing one is replaced.
+          path: file to write.
           restitution: values of α, (rows,); by default those of the reference map.
           packing_fraction: values of ν, (columns,); by default every 0.01 in the range.
+          overwrite: whether a file that is there already is replaced.
 
         Raises:
-          InputError: (a ValueError) a value is outside the measured range.
+          InputError: (a ValueError) a value is outside the measured range, or the file exists.
         """
+        if not overwrite:
+            require_absent(Path(path), "law")
         low, high = self.packing_fraction_range
         alphas = (
             np.unique(self.table.columns["restitution"])
