@@ -279,6 +279,15 @@ def test_run_writes_frames_as_a_trajectory_and_as_a_movie(small_run) -> None:
         assert film.n_frames == 11
 
 
+def test_a_movie_has_forty_frames_and_can_be_sent_by_mail(tmp_path: Path) -> None:
+    flow = ["--restitution", "0.1", "--packing-fraction", "0.75", "--equilibrate", "0.2"]
+    outcome = jaxgran(tmp_path, "run", *flow, "--strain", "1", "--movie", "flow.gif")
+    assert outcome.status in (0, 3)
+    with Image.open(tmp_path / "flow.gif") as film:
+        assert film.n_frames == 40
+    assert (tmp_path / "flow.gif").stat().st_size < 2e6
+
+
 def parsed(text: str) -> dict[str, Any]:
     """The JSON that a command prints: one object, in which every name has the same keys."""
     found = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))

@@ -192,6 +192,10 @@ def test_frames_are_at_the_nearest_time_steps_of_any_strain(flow, flowing, drive
         (3, 2),
     )
     assert steps == [0, 1, 2, 3, 4, 5]
+    steps.clear()
+    few = Recorder(0.01, lambda _, step: steps.append(step), most=3)
+    driven_in_blocks(few.recording(drive), flow, flowing(0.78), (25, 15, 60))
+    assert steps == [0, 10, 20] and few.frames == 3 and few.steps == 100
 
 
 def mean_forces(flow, run, state, steps: int) -> dict[tuple[int, int], float]:

@@ -18,6 +18,7 @@ from jaxgran.model.display import unit_text, with_error
 
 MOST_RECORDED = 100_000  # frames of a trajectory
 _RECORDED_STRAIN = 5.0  # sampled strain where frames are recorded and none is given
+_MOVIE_STRAIN, _MOVIE_FRAMES = 0.005, 40  # between frames of a movie, and its frames
 
 _PHYSICS = (  # what is printed without --all, with the shear-stress ratio below the first
     *("force_ratio", "pressure", "shear_stress", "macroscopic_friction", "inertial_number"),
@@ -28,7 +29,7 @@ _PHYSICS = (  # what is printed without --all, with the shear-stress ratio below
 RUN_EXAMPLES = {
     "A flow in its steady state: averages with errors": "jaxgran run --restitution 0.5 "
     "--packing-fraction 0.7",
-    "A movie of it, about a hundred frames": "jaxgran run --restitution 0.1 --packing-fraction 0.8 "
+    "A movie of one, forty frames": "jaxgran run --restitution 0.1 --packing-fraction 0.8 "
     "--movie flow.gif",
     "All its frames for other programs, every 0.01 of strain": "jaxgran run --restitution 0.5 "
     "--packing-fraction 0.7 --trajectory flow.gsd --frame-strain 0.01",
@@ -49,11 +50,12 @@ RUN_OPTIONS = {
     ),
     "frame_strain": Option(
         "Strain between frames, each at the nearest time step.",
-        default="a hundredth of --strain, or 0.05 with --error",
+        default="0.005 for 40 frames of a movie; a hundredth of --strain, or 0.05 with --error, "
+        "with --trajectory",
     ),
     "force_strain": Option(
         "Strain from each frame on over which its forces are averaged, at most --frame-strain.",
-        default="one time step",
+        default="--frame-strain for a movie, one time step with --trajectory",
     ),
     "all": Option("Print every average, those of the solver's quality last.", bool),
     "json": JSON,
@@ -131,10 +133,15 @@ def _recorder(
     from jaxgran.plotting.movie import MOST_DRAWN, Frames, check_movie
     from jaxgran.sampling.recorder import Recorder
 
+    film_alone = "trajectory" not in files
+    enough = _MOVIE_FRAMES if film_alone and every is None else None
     most = MOST_DRAWN if "movie" in files else MOST_RECORDED
-    least, between = strain / most, strain / 100 if every is None else every
+    least, between = strain / most, _MOVIE_STRAIN if enough else every or strain / 100
     accepted = f"at least {least:g}, for {most} frames, and at most the sampled strain, {strain:g}"
-    require_number("frame_strain", between, lambda x: (x >= 0.99 * least) & (x <= strain), accepted)
+    if every is not None:
+        require_number(
+            "frame_strain", every, lambda x: (x >= 0.99 * least) & (x <= strain), accepted
+        )
     if force_strain is not None:
         accepted = f"above 0 and at most the strain between frames, {between:g}"
         require_number("force_strain", force_strain, lambda x: (x > 0) & (x <= between), accepted)
@@ -145,7 +152,8 @@ def _recorder(
     if "movie" in files:
         check_movie(files["movie"])
         keep.append(film.keep)
-    return Recorder(between, *keep, force_strain=force_strain or 0.0), film
+    averaged = between if film_alone and force_strain is None else force_strain or 0.0
+    return Recorder(between, *keep, force_strain=averaged, most=enough), film
 
 
 def _write_frames(files: Mapping[str, Path], frames: int, film: Any, quiet: bool) -> None:

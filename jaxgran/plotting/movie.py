@@ -33,7 +33,7 @@ from jaxgran.plotting.flow import (
 from jaxgran.plotting.style import empty_figure, styled
 
 MOST_DRAWN = 500  # frames of a movie, which are held in memory while it is written
-_WIDTH, _WIDEST = 7.6, 5.2  # inches, of several flows together and of a single one
+_WIDTH, _WIDEST = 7.6, 4.6  # inches, of several flows together and of a single one
 _MARGIN = 0.1  # inches, around a flow
 _HEAD, _FOOT = 0.4, 0.3  # inches, of the titles above and the legend below
 _DPI = 96  # pixels per inch

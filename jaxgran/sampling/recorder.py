@@ -2,6 +2,7 @@
 taken.
 """
 
+import sys
 from collections.abc import Callable
 from functools import partial, reduce
 from operator import add
@@ -38,10 +39,13 @@ class Recorder:
       force_strain: strain from each frame on in which a copy of the flow is advanced step by step.
         The frame is then the series of these snapshots, which begins at the frame. One time step or
         less for a single snapshot.
+      most: number of frames after which no more are taken, or None for frames to the end.
     """
 
-    def __init__(self, every: float, *keep: Keep, force_strain: float = 0.0):
-        self.every, self.keep, self.force_strain = every, keep, force_strain
+    def __init__(
+        self, every: float, *keep: Keep, force_strain: float = 0.0, most: int | None = None
+    ):
+        self.every, self.keep, self.force_strain, self.most = every, keep, force_strain, most
         self.frames = self.steps = self._taken = 0
 
     def recording(self, advance: AdvanceBatch) -> AdvanceBatch:
@@ -75,8 +79,10 @@ class Recorder:
         return state, reduce(add, tallies)
 
     def _next_frame(self, flow: ShearFlow) -> int:
-        """The time step of the next frame."""
+        """The time step of the next frame; that of no frame if there are enough."""
         number = self._taken + 1
+        if self.most is not None and number >= self.most:
+            return sys.maxsize
         return max(number, int(steps_of_strain(flow, number * self.every).item()))
 
     def _record(self, flow: ShearFlow, numerics: Numerics, state: State) -> None:
