@@ -15,6 +15,7 @@ from benchmarks import (
     enskog_factors,
     gradients,
     paper,
+    reference_figure,
     scaling,
     size_figures,
     stability,
@@ -26,6 +27,7 @@ from benchmarks.pages import read
 from benchmarks.peers import chart
 from jaxgran.maps.results import open_map
 from jaxgran.reference.corrected_shear import MEASURED_LAWS
+from jaxgran.reference.table import shipped_table
 
 PICTURES: dict[str, Callable[[], Figure]] = {
     "collapse": lambda: collapse.draw(read("collapse")["rows"]),
@@ -42,6 +44,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
         enskog_factors.FULL, read("enskog_factors")["rows"]
     ),
     "gradients": lambda: gradients.draw(read("gradients")["flows"]),
+    "reference": lambda: reference_figure.draw(shipped_table()),
     "scaling": lambda: scaling.draw(read("scaling"), read("scaling")["exponents"]),
     "speed_vs_accuracy": lambda: chart.draw(read("speed_vs_accuracy")),
     "stability": lambda: stability.draw(read("stability")["rows"]),

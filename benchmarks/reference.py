@@ -85,7 +85,7 @@ def run(output: Output) -> None:
         print(name, found)
     print(head["plane"])
     output.write_rows("reference", head, "rows", rows)
-    output.write_picture(draw(table), "reference", dpi=300)
+    output.write_picture(draw(table), "reference")
 
 
 # ------------------------------------------------------------------------------------------------

@@ -9,93 +9,68 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.plotting.style import ONE_COLUMN
+from jaxgran.plotting.style import (
+    ALPHA_LABEL,
+    NU_LABEL,
+    ONE_COLUMN,
+    SMALL_SIZE,
+    empty_figure,
+    styled,
+)
 from jaxgran.reference.surface import coordinates
-from jaxgran.reference.table import FACTORS, Table, excess_from_surface
+from jaxgran.reference.table import Table, excess_from_surface
 
-NATURAL = 0.75  # packing fraction above which most natural flows are, in the words of the paper
 LEVELS = (-0.5, -0.25, -0.1, -0.05, 0.05, 0.1, 0.25, 0.5)
-NEGLIGIBLE = 0.02  # a factor this close to one is not shaded
 LABELLED = {-0.5: 0.05, -0.25: 0.03, -0.1: 0.04, -0.05: 0.026}  # 1 − α of the label of a level
-BANDED = 0.1  # the level whose interval is drawn
+RIGHT = 0.1  # relative error of a pressure that counts as predicted
 BINARY = 0.05  # excess of the force ratio on the line of binary collisions
-REGIONS = {  # of the assumption that is furthest off: colour, and what is said of it
-    "local_temperature": ("#cfe3ef", "temperature of long waves"),
-    "anisotropy": ("#e8e8e8", "isotropy"),
-    "chaos": ("#fbe3c0", "molecular chaos"),
-    "pairs": ("#e4d3ea", "pairs of equilibrium"),
-    "binary": ("#f3c6c0", "binary collisions"),
-}
-LINES = ("-", (0, (5, 1.5)), (0, (1, 1)))
 GREEN = "#00602b"
+TICKS = (0.02, 0.05, 0.1, 0.2, 0.5, 0.9)
 POINTS = 240  # along each axis
 
 
+@styled
 def draw(table: Table) -> Figure:
     """The plane of 1 − α and ν."""
     x = np.geomspace(*(1 - np.array(table.range("restitution"))), POINTS)
     y = np.linspace(*table.range("packing_fraction"), POINTS)
     where = coordinates(*np.meshgrid(1 - x, y))
-    figure = Figure(figsize=(ONE_COLUMN, 1.2 * ONE_COLUMN), layout="constrained")
-    axes = figure.add_subplot()
-    axes.set_xscale("log")
-    axes.set_xlim(x.min(), x.max())
-    axes.set_ylim(y.min(), y.max())
-    drawn = _draw_regions(axes, table, x, y, where)
+    figure = empty_figure(ONE_COLUMN, 1.15 * ONE_COLUMN)
+    axes = figure.add_subplot(xscale="log", xlabel=ALPHA_LABEL, ylabel=NU_LABEL)
+    axes.set(xlim=(x.min(), x.max()), ylim=(y.min(), y.max()))
     _draw_errors(axes, table, x, y, where)
-    handles = [Patch(facecolor=REGIONS[name][0], label=REGIONS[name][1]) for name in drawn]
-    handles.append(Line2D([], [], color="black", linewidth=0.9, label="error of the pressure"))
-    handles.append(
-        Patch(facecolor="black", alpha=0.25, label=f"95 % interval of ±{100 * BANDED:.0f} %")
+    coarse, middle, fine = (
+        np.maximum(excess_from_surface(table.ratios[dt](where)[0]), 1e-9)
+        for dt in sorted(table.ratios)[::-1]
     )
-    for style, (timestep, surface) in zip(LINES, sorted(table.ratios.items()), strict=False):
-        excess = excess_from_surface(surface(where)[0])
-        axes.contour(x, y, excess, [BINARY], colors=GREEN, linestyles=[style], linewidths=1.6)
-        label = rf"force ratio 1.05, $\mathrm{{d}}t=10^{{{round(np.log10(timestep))}}}$"
-        handles.append(Line2D([], [], color=GREEN, linestyle=style, linewidth=1.6, label=label))
-    axes.axhline(NATURAL, color="0.35", linewidth=0.8, linestyle=(0, (1, 2)))
-    axes.set_xticks([0.02, 0.05, 0.1, 0.2, 0.5, 0.9], ["0.02", "0.05", "0.1", "0.2", "0.5", "0.9"])
+    axes.contour(x, y, middle, [BINARY], colors=GREEN, linewidths=2, zorder=4)
+    fan = np.maximum(np.log(BINARY / coarse), np.log(fine / BINARY))
+    axes.contourf(x, y, fan, [-99, 0], colors=[GREEN], alpha=0.25, zorder=3)
+    axes.set_xticks(TICKS, [f"{tick:g}" for tick in TICKS])
     axes.minorticks_off()
-    axes.tick_params(direction="in", top=True, right=True, labelsize=7)
-    axes.set_xlabel(r"$1-\alpha$", fontsize=8)
-    axes.set_ylabel(r"packing fraction $\nu$", fontsize=8)
+    axes.set_title(r"nearly elastic $\longleftarrow\qquad\longrightarrow$ dissipative")
+    first, between, last = (rf"10^{{{round(np.log10(dt))}}}" for dt in sorted(table.ratios))
+    handles = [
+        Patch(facecolor="0.88", label="theory within 10 %"),
+        Line2D([], [], color="black", linewidth=0.9, label="error of the pressure"),
+        Patch(facecolor="#f6d5a4", label="its 95 % interval"),
+        Line2D([], [], color=GREEN, linewidth=2, label=rf"force ratio 1.05, d$t={between}$"),
+        Patch(facecolor=GREEN, alpha=0.25, label=rf"the same, ${first}$ to ${last}$"),
+    ]
     figure.legend(
-        handles=handles,
-        loc="outside lower center",
-        ncols=2,
-        fontsize=7,
-        frameon=False,
-        columnspacing=0.8,
-        handlelength=1.8,
-        title="shaded: the assumption that is furthest off",
-        title_fontsize=7,
+        handles=handles, loc="outside lower center", ncols=2, columnspacing=0.8, handlelength=1.5
     )
     return figure
 
 
-def _draw_regions(
-    axes: Axes, table: Table, x: np.ndarray, y: np.ndarray, where: np.ndarray
-) -> list[str]:
-    """Shade by the factor that is furthest from one; return those that are."""
-    logs = np.abs([table.surfaces[f"pressure_{name}"](where)[0] for name in FACTORS])
-    furthest = np.argmax(logs, axis=0)
-    found = []
-    for k, name in enumerate(FACTORS):
-        here = (furthest == k) & (logs[k] > NEGLIGIBLE)
-        if np.mean(here) > 1e-3:
-            found.append(name)
-            axes.contourf(x, y, here.astype(float), [0.5, 1.5], colors=[REGIONS[name][0]], zorder=0)
-    return found
-
-
 def _draw_errors(axes: Axes, table: Table, x: np.ndarray, y: np.ndarray, where: np.ndarray) -> None:
-    """Contours of the error of the pressure, and where one of them may lie."""
+    """Contours of the error of the pressure, and where each of them may lie."""
     over, stderr = table.surfaces["pressure"](where)
     half = np.hypot(HALF_INTERVAL * stderr, np.exp(table.bounds["pressure"](where)[0]))
     error = np.expm1(-over)
-    for level in (-BANDED, BANDED):
-        in_interval = np.abs(np.log1p(level) + over) - half
-        axes.contourf(x, y, in_interval, [-9, 0], colors=["black"], alpha=0.12, zorder=1)
+    axes.contourf(x, y, abs(error), [0, RIGHT], colors=["0.88"], zorder=0)
+    apart = np.min([np.abs(np.log1p(level) + over) for level in LEVELS], axis=0)
+    axes.contourf(x, y, apart - half, [-9, 0], colors=["#f6d5a4"], zorder=1)
     lines = axes.contour(
         x, y, error, LEVELS, colors="black", linestyles="-", linewidths=0.9, zorder=2
     )
@@ -107,6 +82,6 @@ def _draw_errors(axes: Axes, table: Table, x: np.ndarray, y: np.ndarray, where: 
     axes.clabel(
         lines,
         fmt=lambda level: f"{100 * level:+.0f} %".replace("-", "−"),
-        fontsize=7,
+        fontsize=SMALL_SIZE,
         manual=places,
     )
