@@ -494,6 +494,23 @@ def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypa
     assert outcome.err.rstrip().endswith(f"Continue: {command} --resume")
 
 
+@pytest.mark.parametrize(
+    "moment", ["maps.results.write_dataset", "plotting.map_figures.save_figures"]
+)
+def test_an_interruption_after_the_last_point_says_how_to_go_on(
+    moment: str, tmp_path: Path, monkeypatch
+) -> None:
+    """While the dataset is written, and while the figures are drawn."""
+    write_few_variables(monkeypatch)
+    done = {(0, 0): Status.ok, (1, 0): Status.ok}
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(done))
+    monkeypatch.setattr(f"jaxgran.{moment}", Mock(side_effect=KeyboardInterrupt))
+    outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "done.nc")
+    assert outcome.status == 130 and outcome.out == ""
+    assert "jaxgran: interrupted; finished points are saved. Continue: jaxgran map" in outcome.err
+    assert outcome.err.rstrip().endswith("--output done.nc --resume")
+
+
 def test_a_flow_interrupted_before_it_has_a_value_prints_one_sentence(
     tmp_path: Path, monkeypatch
 ) -> None:

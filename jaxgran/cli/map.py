@@ -10,10 +10,16 @@ from typing import Any, get_args
 
 import numpy as np
 
-from jaxgran.cli.measure import entries, finish, print_large_system, run_map
+from jaxgran.cli.measure import (
+    entries,
+    finish,
+    print_large_system,
+    run_map,
+    told_how_to_resume,
+)
 from jaxgran.cli.options import FILE, QUIET, command, of_map
 from jaxgran.cli.output import JSON, print_json, print_table
-from jaxgran.cli.terminal import say_written
+from jaxgran.cli.terminal import say_cache, say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.choices import FileFormat
@@ -69,11 +75,10 @@ def run_map_command(
     if whole and not overwrite:
         require_new_figures(output, format)
     data, interrupted, written = run_map(given, quiet)
-    pictures = (
-        []
-        if interrupted
-        else draw_beside(data if whole else None, output, format, overwrite, existed)
-    )
+    pictures = []
+    if not interrupted:
+        with told_how_to_resume(output, finished=True):
+            pictures = draw_beside(data if whole else None, output, format, overwrite, existed)
     if json:
         print_json(entries(data))
     elif whole:
@@ -136,6 +141,7 @@ def run_plot_command(
     dpi: int = 200,
     caption: bool = True,
 ) -> None:
+    say_cache()  # before Matplotlib looks for its own
     from jaxgran.maps.results import open_map
     from jaxgran.plotting.map_figures import require_file, save_figures
 

@@ -4,8 +4,8 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,8 +20,9 @@ from jaxgran.cli.terminal import (
     require_device,
     say,
     say_written,
+    stop,
 )
-from jaxgran.maps.interruption import Interrupted
+from jaxgran.maps.interruption import Interrupted, is_interruption
 from jaxgran.maps.settings import OPTIONS
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import with_error
@@ -68,11 +69,31 @@ def run_map(parameters: Mapping[str, Any], quiet: bool) -> Outcome:
         warnings.showwarning = lambda warning, *_, **__: say(f"{warning}")
         warnings.simplefilter("always", UserWarning, append=True)  # after the filters of a command
         warnings.simplefilter("ignore", BadPoints)  # ``finish`` prints these
-        try:
-            data = ratio_map(**given)
-        except Interrupted as interruption:
-            data, interrupted = interruption.data, True
+        with told_how_to_resume(output):
+            try:
+                data = ratio_map(**given)
+            except Interrupted as interruption:
+                data, interrupted = interruption.data, True
     return Outcome(data, interrupted, _stamp(output) != before)
+
+
+@contextmanager
+def told_how_to_resume(output: Path | None, finished: bool = False) -> Iterator[None]:
+    """An interruption of the block ends the command, and says what is saved and how to go on."""
+    try:
+        yield
+    except BaseException as error:
+        if not is_interruption(error):
+            raise
+        stop(f"interrupted; {_saved(output, finished, finished)}", interrupted_status())
+
+
+def _saved(output: Path | None, written: bool, finished: bool = False) -> str:
+    """What an interruption left, and the command that continues from it, if one does."""
+    if output is not None and (finished or os.path.isdir(f"{output}.unfinished")):
+        resume = "" if "--resume" in sys.argv else " --resume"
+        return f"finished points are saved. Continue: {command_line()}{resume}"
+    return "finished points are saved." if written else "nothing is saved."
 
 
 def _numerics(parameters: Mapping[str, Any]) -> dict[str, Any]:
@@ -249,12 +270,7 @@ def finish(
         missing = (
             "" if data.status.size == 1 else f" with {len(bad.get('not_run', []))} points missing"
         )
-        saved = "nothing is saved."
-        if output is not None and os.path.isdir(f"{output}.unfinished"):
-            resume = "" if "--resume" in data.attrs["command"] else " --resume"
-            saved = f"finished points are saved. Continue: {data.attrs['command']}{resume}"
-        elif written:
-            saved = "finished points are saved."
+        saved = _saved(output, bool(written))
         say(f"jaxgran: interrupted{missing}; {saved}")
         raise SystemExit(interrupted_status())
     if bad:

@@ -18,6 +18,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -83,13 +84,13 @@ def exit_status(app: Callable[..., Any]) -> int:
 
 def run_program(app: Callable[..., Any]) -> NoReturn:
     """Run the program, and end its process."""
-    status = NO_FILE
+    status = 0
     try:
         status = exit_status(app)
         sys.stdout.flush()  # a full disk fails here, and not when Python ends
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python fails as it ends
-        if not isinstance(error, BrokenPipeError):
+        if not isinstance(error, BrokenPipeError) and status != NO_FILE:
             say(f"jaxgran: {_of_file(error)}")
         status = NO_FILE
     _end_without_threads(status)
@@ -142,7 +143,8 @@ def stop(sentence: str, status: int = INPUT_MISTAKE) -> NoReturn:
 def _print_json_error(sentence: str) -> None:
     """Print an error as the object that was asked for."""
     if "--json" in sys.argv:
-        print_json({"error": Entry(sentence, "why there is no result", None)})
+        with suppress(OSError):  # it is the reason why there is no result
+            print_json({"error": Entry(sentence, "why there is no result", None)})
 
 
 def interrupted_status() -> int:
@@ -155,7 +157,7 @@ def configured_jax():
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    _say_cache()
+    say_cache()
     use_cache()
     return jax
 
@@ -169,7 +171,7 @@ def require_device() -> None:
 
 
 @cache
-def _say_cache() -> None:
+def say_cache() -> None:
     """Print once if the cache is not in the user's folder; Matplotlib's cache then goes to the same
     place.
     """

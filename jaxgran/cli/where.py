@@ -66,6 +66,9 @@ def run_where_command(
 ) -> None:
     if csv and json:
         raise InputError("`csv` and `json` exclude each other.", field="csv")
+    no_pair = restitution is None or packing_fraction is None
+    if no_pair and (law is None or csv or json):
+        raise InputError("`restitution` and `packing_fraction` are required, or `law` alone.")
     if law is not None:
         from jaxgran.io.paths import require_place
         from jaxgran.reference.law import constitutive_law
@@ -74,8 +77,6 @@ def run_where_command(
         constitutive_law().to_csv(law, restitution, packing_fraction, overwrite)
         say_written([law])
     if restitution is None or packing_fraction is None:
-        if law is None:
-            raise InputError("`restitution` and `packing_fraction` are required, or `law`.")
         return
     plane = np.meshgrid(restitution, packing_fraction)
     is_point = plane[0].size == 1
