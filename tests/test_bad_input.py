@@ -384,9 +384,6 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "dpi must be": lambda: jg.save_figures(ratio_dataset(), "map", dpi=49),
     "colour must be": lambda: jg.flow_figure(SEEN, "mass"),
     "it has no number at its points": lambda: jg.explore(ratio_dataset()[["status"]]),
-    "at most 100 numbers of grains": lambda: jg.explore(
-        with_timesteps(ratio_dataset(1, 1), *np.geomspace(1e-5, 1e-3, 101).tolist())
-    ),
     "movie must be": lambda: check_movie(Path("flow.avi")),
     "trajectory must be": lambda: check_trajectory(Path("flow.nc")),
     "seen must be a flow of finite positions": lambda: jg.flow_figure(

@@ -20,8 +20,11 @@ import jaxgran as jg
 from jaxgran.maps.schema import flattened, path_of
 from jaxgran.model.display import with_error
 from jaxgran.page.document import Page
-from jaxgran.page.grain_data import grain_data, scale_of
+from jaxgran.page.grain_data import PARTS, grain_data
 from jaxgran.page.map_data import MOST_POINTS, map_data
+from jaxgran.page.reference_map import reference_dataset
+from jaxgran.plotting.flow import bar_images, common_scale, grain_images
+from jaxgran.plotting.plane import contour_variable
 from jaxgran.reference.table import MEASURED, Table, shipped_table
 from jaxgran.sampling.observables import OBSERVABLES
 
@@ -38,15 +41,25 @@ def written(page: Page) -> dict:
     return json.loads(text[1])
 
 
+def by_name(page: dict) -> dict[str, dict]:
+    """The observables of a page by their names, without units."""
+    labels = {one["label"]: one for one in page["observables"]}
+    return {label.split(" (")[0].replace(" ", "_"): one for label, one in labels.items()}
+
+
+def values(one: dict) -> list:
+    return one["views"][0]["scales"][0]["z"]
+
+
 def assert_same_numbers(shown: list, expected: np.ndarray) -> None:
     """To six digits; None where there is no number."""
     numbers = np.array([math.nan if x is None else x for x in shown])
-    np.testing.assert_allclose(numbers, np.ravel(expected), rtol=5e-7, atol=0)
+    np.testing.assert_allclose(numbers, np.ravel(expected), rtol=5e-7, atol=1e-15)
 
 
-def texts(values: xr.DataArray, errors: xr.DataArray | None, dims: tuple[str, ...]) -> list[str]:
+def texts(value: xr.DataArray, errors: xr.DataArray | None, dims: tuple[str, ...]) -> list[str]:
     """What the command line prints of each point."""
-    numbers = [np.ravel(x.transpose(*dims)) for x in (values, errors) if x is not None]
+    numbers = [np.ravel(x.transpose(*dims)) for x in (value, errors) if x is not None]
     return [
         (with_error(*map(float, some)) if len(some) == 2 else f"{some[0]:.6g}")
         if np.isfinite(some[0])
@@ -56,104 +69,101 @@ def texts(values: xr.DataArray, errors: xr.DataArray | None, dims: tuple[str, ..
 
 
 def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
-    data, by_name = (
-        flattened(page_map()).sortby("timestep"),
-        {one["name"]: one for one in found["observables"]},
-    )
+    data, shown = flattened(page_map()).sortby("timestep"), by_name(found)
     dims = ("timestep", "packing_fraction", "restitution")
     strain = data["sums/strain"].sum("seed")
     for name, observable in OBSERVABLES.items():
         if observable.tensor:
             for a, b in np.ndindex(2, 2):
-                assert_same_numbers(
-                    by_name[f"{name}_{'xy'[a]}{'xy'[b]}"]["value"],
-                    data[path_of(name)].values[..., a, b],
-                )
+                component = shown[f"{name}_{'xy'[a]}{'xy'[b]}"]
+                assert_same_numbers(values(component), data[path_of(name)].values[..., a, b])
             continue
-        one = by_name[name]
-        assert one["meaning"] == observable.meaning and (observable.unit == "1") == (
-            one["unit"] == ""
-        )
-        assert_same_numbers(one["value"], data[path_of(name)].transpose(*dims).values)
+        one, average = shown[name], data[path_of(name)]
+        error = data.get(f"{path_of(name)}_stderr")
+        view, (text, theory, samples, large) = one["views"][0], one["texts"]
+        assert one["meaning"] == observable.meaning
+        assert (observable.unit == "1") == (one["label"] == name.replace("_", " "))
+        assert_same_numbers(values(one), average.transpose(*dims).values)
         if observable.group != "diagnostics":
-            assert_same_numbers(
-                one["error"], data[f"{path_of(name)}_stderr"].transpose(*dims).values
-            )
-        assert ("theory" in one) == (f"theory/{name}" in data)
-        large = f"{name}_large_system"
-        assert ("large" in one) == (large in data)
-        if "theory" in one:
-            assert_same_numbers(one["theory"], data[f"theory/{name}"].values)
-        values, errors = data[path_of(name)], data.get(f"{path_of(name)}_stderr")
-        if "large" in one:
-            half_width = data[f"{large}_ci95"].sel(error_source="total")
-            assert one["large"] == texts(data[large], half_width, dims)
-        assert one["text"] == texts(values, errors, dims)
+            assert_same_numbers(view["error"], error.transpose(*dims).values)
+        assert ("theory" in view) == (theory is not None) == (f"theory/{name}" in data)
+        if "theory" in view:
+            assert_same_numbers(view["theory"], data[f"theory/{name}"].values)
+            quotient = average.transpose(*dims).values / data[f"theory/{name}"].values
+            assert_same_numbers(one["views"][1]["scales"][0]["z"], quotient)
+        assert (large is not None) == (f"{name}_large_system" in data)
+        if large is not None:
+            half_width = data[f"{name}_large_system_ci95"].sel(error_source="total")
+            assert large == texts(data[f"{name}_large_system"], half_width, dims)
+        assert text == texts(average, error, dims)
         if not observable.extreme:
             correlated = data["diagnostics/correlation_strain"].sel(observable=name)
-            assert_same_numbers(one["samples"], (strain / correlated).values)
-    ratio = data.force_ratio.transpose(*dims).values
-    assert_same_numbers(by_name["excess"]["value"], ratio - 1)
-    assert [axis["values"] for axis in found["axes"]] == [
-        [64],
-        [5e-4, 1e-3],
-        [0.5, 0.6],
-        [0.5, 0.7, 0.9],
-    ]
-    assert not [
-        name for name in by_name if re.search("_stderr|_seed|large_system|snapshot|status", name)
-    ]
+            expected = (strain / correlated).values.ravel()
+            assert samples == [f"{x:.3g}" if np.isfinite(x) else "–" for x in expected]
+    assert_same_numbers(values(shown["excess"]), data.force_ratio.transpose(*dims).values - 1)
+    assert (found["x"], found["y"]) == ([0.5, 0.3, 0.1], [0.5, 0.6])
+    assert texts_of(found, "grains") == ["64"] and texts_of(found, "timestep") == ["5e-4", "0.001"]
+    hidden = "_stderr|_seed|large_system|snapshot|status"
+    assert not [name for name in shown if re.search(hidden, name)]
+
+
+def texts_of(page: dict, choice: str) -> list[str]:
+    return next(one["texts"] for one in page["choices"] if one["name"] == choice)
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_levels_are_round_numbers_within_the_values_where_the_scale_has_them(log: bool) -> None:
+    view = by_name(map_data(reference_dataset()))["excess" if log else "force_ratio"]["views"][0]
+    scale = view["scales"][log]
+    for levels, most in zip(scale["levels"][0], (5, 10, 20), strict=True):
+        assert 1 <= len(levels) <= most + 1
+        for place, text in levels:
+            assert min(scale["z"]) <= place <= max(scale["z"])
+            assert len(f"{float(text):.2g}") >= len(f"{float(text):.6g}")  # two digits at most
+            expected = contour_variable(np.array(float(text))) if log else float(text)
+            assert place == pytest.approx(float(expected), rel=1e-6)
 
 
 def test_points_without_a_number_and_with_a_bad_status_are_told_apart(found) -> None:
     """Point 8 of the settings was not run; the shorter time step comes first on a page."""
-    assert found["status"] == ["ok", "deep_overlap", "not_run", *["ok"] * 9]
-    assert [one is None for one in found["observables"][0]["value"]] == [k == 2 for k in range(12)]
+    assert found["bad"] == [False, True, True, *[False] * 9]
+    assert [one is None for one in values(found["observables"][0])] == [k == 2 for k in range(12)]
     assert [one is None for one in found["instants"]] == [k == 2 for k in range(12)]
-    assert {"deep_overlap", "not_run"} <= set(found["meanings"])
+    assert found["status"][0] == "Status ok."
+    assert found["status"][1].startswith("Status deep overlap: ")
 
 
 def test_instant_is_packed_without_visible_loss() -> None:
     one = random_instant(1, grains=50, pairs=9)
-    scale = scale_of(one.speed, one.force)
-    packed = grain_data(**one._asdict(), scale=scale)
-    raw = base64.b64decode(packed["data"])
-    n, p = packed["grains"], packed["pairs"]
-    x, y, i, j = np.split(np.frombuffer(raw[: 4 * (n + p)], "<u2"), [n, 2 * n, 2 * n + p])
-    radius, speed, force, clustered = np.split(
-        np.frombuffer(raw[4 * (n + p) :], np.uint8), [n, 2 * n, 2 * n + p]
-    )
-    cell = (
-        np.stack(
-            [one.positions[:, 0] - one.tilt * one.positions[:, 1], one.positions[:, 1]], axis=-1
-        )
-        / one.side
-    )
-    assert np.all(np.abs((np.stack([x, y], axis=-1) / 65536 - cell + 0.5) % 1 - 0.5) <= 1 / 65536)
-    np.testing.assert_array_equal(np.stack([i, j], axis=-1), one.pairs)
-    np.testing.assert_array_equal(clustered, one.clustered)
-    np.testing.assert_allclose(
-        radius / 255 * packed["radius"], one.radii, atol=one.radii.max() / 500
-    )
-    np.testing.assert_allclose(speed / 255, np.minimum(one.speed / scale.speed, 1), atol=1 / 500)
-    np.testing.assert_allclose(force / 255, np.minimum(one.force / scale.force, 1), atol=1 / 500)
+    packed, unit = grain_data(one), one.side / PARTS
+    grains, bars = (np.frombuffer(base64.b64decode(packed[x]), "<i2") for x in ("grains", "bars"))
+    x, y, radius, colour = grains.reshape(4, -1)
+    which, centres = grain_images(one)
+    assert set(which) == set(range(50)) and len(which) > 50
+    np.testing.assert_allclose(np.stack([x, y], axis=-1) * unit, centres, atol=unit)
+    np.testing.assert_allclose(radius * unit, one.radii[which], atol=unit)
+    share = np.minimum(one.speed / common_scale([one], "speed").colour, 1)
+    np.testing.assert_allclose(colour / 63, share[which], atol=1 / 126)
+    pairs, middles, along, widths = bar_images(one, common_scale([one], "speed").force)
+    *lengths, clustered = bars.reshape(6, -1)
+    expected = [*middles.T, *along.T, widths]
+    np.testing.assert_allclose(np.multiply(lengths, unit), expected, atol=unit)
+    np.testing.assert_array_equal(clustered, one.clustered[pairs])
 
 
 def test_numbers_of_grains_are_an_axis_or_stand_at_their_points() -> None:
     data = ratio_dataset(2, 2)
-    assert map_data(with_grains(data, 64, 256))["axes"][0]["values"] == [64, 256]
+    assert texts_of(map_data(with_grains(data, 64, 256)), "grains") == ["64", "256"]
     page = map_data(data.assign(point_grains=(data.force_ratio.dims, [[64, 90], [128, 256]])))
-    assert page["grains"] == [64, 90, 128, 256]
+    assert [re.search(r"N = (\d+)", x)[1] for x in page["headings"]] == ["64", "90", "128", "256"]
 
 
-def test_million_points_are_thinned_with_a_word_about_it() -> None:
-    page = map_data(ratio_dataset(1000, 1000))
-    axes = [axis["values"] for axis in page["axes"][2:]]
-    assert 0.9 * MOST_POINTS < len(axes[0]) * len(axes[1]) == len(page["status"]) <= MOST_POINTS
-    assert (axes[0][0], axes[0][-1], axes[1][0], axes[1][-1]) == (0.3, 0.8, 0.1, 0.9)
-    (note,) = page["notes"]
-    assert one_sentence(note.replace("points. This", "points: this")) and "1000000 points" in note
-    assert len(map_data(ratio_dataset(1, 100_000))["status"]) == MOST_POINTS
+@pytest.mark.parametrize("shape", [(1000, 1000), (1, 100_000)])
+def test_many_points_are_thinned_with_a_word_about_it(shape: tuple[int, int]) -> None:
+    page = map_data(ratio_dataset(*shape))
+    assert MOST_POINTS / 2 < len(page["x"]) * len(page["y"]) == len(page["status"]) <= MOST_POINTS
+    assert one_sentence(page["notes"]) and f"of {max(shape)} values" in page["notes"]
+    assert map_data(ratio_dataset(2, 2))["notes"] == ""
 
 
 def test_names_and_attributes_cannot_leave_the_data_of_a_page() -> None:
@@ -164,7 +174,7 @@ def test_names_and_attributes_cannot_leave_the_data_of_a_page() -> None:
         and "<u>name" not in page.text
     )
     assert written(page)["title"] == MARKUP
-    assert "own <u>name</u>" in [one["name"] for one in written(page)["observables"]]
+    assert "own_<u>name</u>" in by_name(written(page))
     assert f"<title>{html.escape(MARKUP)}</title>" in page.text
     assert page.text.count("<script") == page.text.count("</script>") == 3
 
@@ -178,19 +188,15 @@ def test_page_forbids_itself_every_request() -> None:
 
 @pytest.mark.parametrize("name", ["activation", "solver_requested", "tolerance", "seeds"])
 def test_attribute_that_is_no_option_gives_no_command_to_paste(name: str) -> None:
-    data = page_map()
+    data = flattened(page_map())
     again = map_data(data)["again"]
-    assert again["options"] == "--solver barzilai-borwein --activation midpoint --tolerance 0.0001"
-    assert_same_numbers(
-        again["strain"], flattened(data)["sums/strain"].mean("seed").sortby("timestep").values
-    )
-    jammed = flattened(data).assign(
-        force_ratio=data.force_ratio.where(data.restitution > data.restitution.min())
-    )
-    assert sum(strain is None for strain in map_data(jammed)["again"]["strain"]) > again[
-        "strain"
-    ].count(None)
-    assert map_data(flattened(data).assign_attrs({name: "midpoint; rm -rf ~"}))["again"] is None
+    assert again[2] == "" and again[3].startswith("jaxgran map --restitution 0.5 --packing-fr")
+    assert again[3].endswith("--activation midpoint --tolerance 0.0001 --seeds 2 --output point.nc")
+    strain = float(data["sums/strain"].mean("seed").sortby("timestep").values.ravel()[3])
+    assert f" --strain {float(f'{4 * strain:.3g}'):g} " in again[3]
+    jammed = data.assign(force_ratio=data.force_ratio.where(data.restitution > 0.5))
+    assert map_data(jammed)["again"][3] == ""
+    assert set(map_data(data.assign_attrs({name: "midpoint; rm -rf ~"}))["again"]) == {""}
 
 
 def test_explore_writes_a_page_that_a_notebook_shows(tmp_path: Path) -> None:
@@ -222,14 +228,13 @@ def test_a_page_has_the_verdict_on_every_flow_in_the_range_of_the_reference_map(
 
 def test_a_page_without_a_map_is_the_reference_map_with_every_point_of_its_table() -> None:
     table, page = shipped_table(), written(jg.explore())
-    by_name = {one["name"]: one for one in page["observables"]}
-    nus, alphas = (page["axes"][k]["values"] for k in (2, 3))
-    places = [nus.index(nu) * len(alphas) + alphas.index(alpha) for alpha, nu in flows_of(table)]
+    shown, nus = by_name(page), page["y"]
+    ones = [round(1 - x, 9) for x in page["x"]]
+    places = [nus.index(nu) * len(ones) + ones.index(alpha) for alpha, nu in flows_of(table)]
     for name in (*MEASURED, "force_ratio"):
-        assert_same_numbers([by_name[name]["value"][k] for k in places], table.columns[name])
-        assert_same_numbers(
-            [by_name[name]["error"][k] for k in places], table.columns[f"{name}_stderr"]
-        )
+        assert_same_numbers([values(shown[name])[k] for k in places], table.columns[name])
+        errors = [shown[name]["views"][0]["error"][k] for k in places]
+        assert_same_numbers(errors, table.columns[f"{name}_stderr"])
     assert all(page["reference"]["flows"])
     assert page["title"].endswith(table.made_with)
 

@@ -5,7 +5,6 @@ from pathlib import Path
 from jaxgran.cli.options import OVERWRITE, command
 from jaxgran.cli.terminal import say_written
 from jaxgran.maps.options import Option
-from jaxgran.model.checks import InputError, short_repr
 
 EXPLORE_EXAMPLES = {
     "A page beside the map": "jaxgran explore jaxgran_map.nc",
@@ -30,21 +29,15 @@ EXPLORE_OPTIONS = {
 def run_explore_command(
     file: Path | None, output: Path | None = None, overwrite: bool = False
 ) -> None:
-    from jaxgran.io.paths import require_place
+    from jaxgran.io.paths import require_absent, require_place
     from jaxgran.maps.results import open_map
-    from jaxgran.page.document import require_plotly
-    from jaxgran.page.explore import explore, shows_same_map
+    from jaxgran.page.explore import explore
 
     path = (file or Path("reference_map.nc")).with_suffix(".html") if output is None else output
     require_place(path, "output", ".html")
-    require_plotly()
+    if not overwrite:
+        require_absent(path, "output")
     page = explore(None if file is None else open_map(file))
-    if path.exists() and not overwrite and not shows_same_map(path, page):
-        raise InputError(
-            f"output {short_repr(str(path))} already exists and belongs to another map; "
-            "pass `overwrite=True` to replace it.",
-            field="output",
-        )
     page.save(path)
     say_written([path])
 

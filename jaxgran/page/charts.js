@@ -1,150 +1,113 @@
-// The plane of 1 − α and ν, and the curves through the chosen point. A "view" is what charts need of the map:
-// x, y: values of 1 − α and ν; value, error, theory, status: by row of ν and column of α; label; log.
+// The plane of 1 − α and ν, and the curves through the chosen point, from the data of map_data.py.
 "use strict";
 
-const RING = { symbol: "circle-open", size: 15, color: "#b2182b", line: { width: 2 } };
-const SCALE = [[0, "#f7fafc"], [0.35, "#bdd7ea"], [0.7, "#6ba3d0"], [1, "#2b6cab"]]; // dark enough in grey, light enough for black lines
-const EXCESS_LINEAR_BELOW = 0.01; // as in the contours of Figure 2
-const EXCESS_STEPS = 6; // of the interpolation between two points
+const element = (id) => document.getElementById(id);
+const data = JSON.parse(element("data").textContent);
+const { x, y, observables, choices } = data;
+// Dark enough in grey, light enough for black lines.
+const SHADES = [[0, "#f7fafc"], [0.35, "#bdd7ea"], [0.7, "#6ba3d0"], [1, "#2b6cab"]];
+const SCATTER = { type: "scatter", mode: "markers", showlegend: false, hoverinfo: "skip" };
+const SETTINGS = { displayModeBar: false, responsive: true };
 
-const flat = (rows) => rows.flat();
-const shown = (value) => value !== null && Number.isFinite(value);
+const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
+// Plotly takes some markup in its texts, so signs that could begin one are escaped.
+const escaped = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+const ring = (size) => ({ symbol: "circle-open", size, color: colour("bad"), line: { width: 2 } });
+const diamond = (size) => ({ symbol: "diamond-open", size, color: "#c05600", line: { width: 3 } });
 
-// Round levels between the smallest and the largest value, about as many as asked for.
-function roundLevels(values, count) {
-  const low = Math.min(...values), high = Math.max(...values);
-  if (!(high > low)) return { start: low, end: low, size: 1, levels: [low] };
-  const rough = (high - low) / count;
-  const unit = 10 ** Math.floor(Math.log10(rough));
-  const size = unit * [1, 2, 5, 10].find((step) => step * unit >= rough * 0.999);
-  const noise = 0.02 * (high - low); // the lowest level is above what may be scatter around a constant
-  const start = Math.ceil((low + noise) / size) * size;
-  const levels = [];
-  for (let level = start; level <= high * (1 + 1e-9) + 1e-300; level = start + levels.length * size) levels.push(level);
-  return { start, end: levels.at(-1) ?? start, size, levels };
+// The library is compressed, as it is by far the largest part of the page.
+async function loadPlotly() {
+  const bytes = Uint8Array.from(atob(element("library").textContent), (c) => c.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const script = document.createElement("script");
+  script.textContent = await new Response(stream).text();
+  document.head.append(script);
 }
 
-// The logarithms of levels that can be read off: of 1, 2 and 5 in each decade, of 1 alone if these are more than asked
-// for, or of round levels if these are too few.
-function logLevels(logarithms, count) {
-  const low = Math.min(...logarithms), high = Math.max(...logarithms);
-  const decades = Array.from({ length: Math.ceil(high) - Math.floor(low) + 1 }, (_, k) => Math.floor(low) + k);
-  const within = (digits) => decades.flatMap((decade) => digits.map((digit) => decade + Math.log10(digit)))
-    .filter((level) => level >= low - 1e-9 && level <= high + 1e-9);
-  const [every, powers] = [within([1, 2, 5]), within([1])];
-  if (every.length > 2 && every.length <= count) return every;
-  if (powers.length > 1) return powers;
-  return roundLevels([10 ** low, 10 ** high], count).levels.filter((level) => level > 0).map(Math.log10);
+// Draws a chart; grids and texts follow the light or dark scheme of the reader.
+function draw(id, traces, xaxis, yaxis, further) {
+  const axis = { gridcolor: colour("grid"), zerolinecolor: colour("grid"), automargin: true };
+  Plotly.react(id, traces, {
+    paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+    font: { color: colour("text"), family: "system-ui, sans-serif", size: 13 },
+    margin: { l: 8, r: 16, t: 40, b: 8 }, hovermode: "closest", hoverlabel: { align: "left" },
+    dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom", // a finger scrolls the page
+    xaxis: { ...axis, ...xaxis }, yaxis: { ...axis, ...yaxis }, ...further,
+  }, SETTINGS);
 }
 
-// A field between the points of the map, bilinearly; null where a point without a value would count.
-function interpolated(field, steps) {
-  const axis = (count) => Array.from({ length: (count - 1) * steps + 1 }, (_, k) => k / steps);
-  const between = (low, high, share) => (share ? (low === null || high === null ? null : low + share * (high - low)) : low);
-  const along = (row, at) => between(row[Math.floor(at)], row[Math.ceil(at)], at % 1);
-  return axis(field.length).map((at) => {
-    const [low, high] = [field[Math.floor(at)], field[Math.ceil(at)]];
-    return axis(field[0].length).map((column) => between(along(low, column), along(high, column), at % 1));
-  });
+function hoverText(point) {
+  const lines = data.columns.slice(1).map((column, k) => [column, chosenObservable().texts[k]])
+    .filter(([, texts]) => texts).map(([column, texts]) => `${column}: ${texts[point]}`);
+  const text = [data.headings[point], chosenObservable().label, ...lines, data.status[point]];
+  return text.map(escaped).join("<br>");
 }
 
-// The contours of the excess of the force ratio over one, each wider than the one before. Their labels stand at the
-// right edge, where the lines are far from each other.
-function excessTraces(excess, x, y, levels) {
-  const bent = excess.map((row) => row.map((e) => (e === null ? null : Math.asinh(e / EXCESS_LINEAR_BELOW))));
-  const z = interpolated(bent, EXCESS_STEPS).map((row) => row.map((b) => (b === null ? null : EXCESS_LINEAR_BELOW * Math.sinh(b))));
-  const [fineX, fineY] = [x, y].map((axis) => interpolated([axis], EXCESS_STEPS)[0]);
-  const lines = levels.map((level, k) => ({
-    type: "contour", x: fineX, y: fineY, z, name: `excess ${level}`, showscale: false, hoverinfo: "skip", showlegend: false,
-    contours: { start: level, end: level, size: 1, coloring: "none" }, line: { color: "#111", width: 1 + 0.6 * k },
-  }));
-  const edge = fineX.indexOf(Math.max(...fineX));
-  const crossings = levels.map((level) => z.findIndex((row, k) => k > 0 && shown(row[edge]) && shown(z[k - 1][edge]) && row[edge] >= level && z[k - 1][edge] < level));
-  const labels = levels.map((level, k) => ({ level, at: crossings[k] })).filter(({ at }) => at > 0);
-  return [...lines, {
-    type: "scatter", mode: "text", name: "levels of the excess", hoverinfo: "skip", showlegend: false, cliponaxis: false,
-    x: labels.map(() => fineX[edge]), y: labels.map(({ at }) => fineY[at]), text: labels.map(({ level }) => `  ${level.toFixed(2)}`),
-    textposition: "middle right", textfont: { size: 12, color: colour("text") },
-  }];
-}
-
-function planeTraces(view, levelCount, excessLevels) {
-  const { x, y, value, log } = view;
-  const z = value.map((row) => row.map((v) => (!shown(v) || (log && v <= 0) ? null : log ? Math.log10(v) : v)));
-  const known = flat(z).filter((v) => v !== null);
-  const levels = roundLevels(known, levelCount);
-  const ticks = log && known.length ? logLevels(known, levelCount) : levels.levels;
-  const bar = {
-    title: { text: escaped(view.label), side: "right" }, tickvals: ticks, ticktext: ticks.map((tick) => numberText(log ? 10 ** tick : tick, 3)),
-    thickness: 14, outlinewidth: 0, len: 1, xpad: excessLevels ? 36 : 10, // the levels of the excess stand before it
-  };
-  const colours = { colorscale: SCALE, colorbar: bar, zmin: Math.min(...known), zmax: Math.max(...known) };
+function drawPlane() {
+  const { view, scale, levels } = chosenView(), at = (list, cells) => cells.map((k) => list[k]);
+  const cells = data.headings.slice(0, x.length * y.length).map((_, k) => k);
+  const [cellX, cellY] = [cells.map((k) => x[k % x.length]), cells.map((k) => y[Math.floor(k / x.length)])];
+  const height = cells.map((k) => scale.z[k + firstPoint()]);
   const isPlane = x.length > 1 && y.length > 1;
-  const points = { x: [], y: [], text: [], customdata: [], colour: [] };
-  const bad = { x: [], y: [] }, missing = { x: [], y: [] };
-  y.forEach((nu, row) => x.forEach((a, column) => {
-    const group = shown(value[row][column]) ? points : missing;
-    for (const list of [points, ...(group === missing ? [missing] : [])]) { list.x.push(a); list.y.push(nu); }
-    points.text.push(view.hover(row, column));
-    points.customdata.push([row, column]);
-    points.colour.push(z[row][column]);
-    if (group === points && view.status[row][column] !== "ok") { bad.x.push(a); bad.y.push(nu); }
+  const colorbar = {
+    title: { text: escaped(view.label), side: "top" }, outlinewidth: 0, thickness: 14, orientation: "h",
+    y: 1.02, yanchor: "bottom", tickvals: levels.map(([place]) => place), ticktext: levels.map(([, text]) => text),
+  };
+  const field = {
+    type: "contour", x, y, z: y.map((_, row) => height.slice(row * x.length, (row + 1) * x.length)),
+    colorscale: SHADES, colorbar, hoverinfo: "skip", connectgaps: false, name: "observable",
+    contours: { coloring: "heatmap" }, line: { width: 0 },
+  };
+  const lines = levels.map(([place, text]) => ({
+    ...field, name: `level ${text}`, showscale: false, line: { color: "rgba(40,60,80,0.55)", width: 0.8 },
+    contours: { start: place, end: place, size: 1, coloring: "none", showlabels: !chosen.log, labelfont: { size: 11, color: "#345" } },
   }));
-  const traces = [];
-  if (isPlane && known.length) {
-    const field = { type: "contour", x, y, z, hoverinfo: "skip", connectgaps: false, line: { color: "rgba(40,60,80,0.55)", width: 0.8 } };
-    const filled = { start: levels.start, end: levels.end, size: levels.size, coloring: "fill", showlabels: true, labelfont: { size: 11, color: "#345" } };
-    traces.push({ ...field, ...colours, name: "observable", contours: log ? { coloring: "heatmap", showlines: false } : filled });
-    // Levels of one contour trace have equal steps, and these have not.
-    if (log) traces.push(...ticks.map((tick) => ({ ...field, showscale: false, name: "level", contours: { start: tick, end: tick, size: 1, coloring: "none" } })));
-    if (excessLevels) traces.push(...excessTraces(view.excess, x, y, excessLevels));
-  }
+  const excess = (chosen.excess && data.excess[part()]) || [];
+  const contours = excess.map((one, k) => ({
+    ...SCATTER, mode: "lines", name: `excess ${one.text}`, x: one.x, y: one.y, line: { color: "#111", width: 1 + 0.6 * k },
+  }));
+  const labelled = excess.filter((one) => one.edge.length);
+  const right = Math.max(...x);
+  const points = (name, chosenCells, marker) => ({ ...SCATTER, name, x: at(cellX, chosenCells), y: at(cellY, chosenCells), marker });
+  const known = (k) => data.bad[k + firstPoint()] && height[k] !== null;
   const dots = isPlane ? { size: 7, color: "#223", line: { color: "white", width: 1 } }
-    : { size: 16, color: points.colour, colorscale: SCALE, colorbar: bar, cmin: colours.zmin, cmax: colours.zmax, line: { color: colour("text"), width: 1 } };
-  const scatter = { type: "scatter", mode: "markers", showlegend: false };
-  traces.push({ ...scatter, x: points.x, y: points.y, marker: dots, text: points.text, customdata: points.customdata, hovertemplate: "%{text}<extra></extra>", name: "points" });
-  traces.push({ ...scatter, ...bad, marker: RING, hoverinfo: "skip", name: "bad status" });
-  traces.push({ ...scatter, ...missing, marker: { symbol: "x-thin", size: 11, line: { color: colour("text"), width: 2 } }, hoverinfo: "skip", name: "no value" });
-  traces.push({ ...scatter, x: [x[view.column]], y: [y[view.row]], marker: { symbol: "diamond-open", size: 20, color: "#c05600", line: { width: 3 } }, hoverinfo: "skip", name: "chosen point" });
-  return traces;
+    : { size: 16, color: height, colorscale: SHADES, colorbar, line: { color: colour("text"), width: 1 } };
+  draw("plane", [
+    ...(isPlane ? [field, ...lines] : []), ...contours,
+    {
+      ...SCATTER, mode: "text", name: "levels of the excess", cliponaxis: false, textposition: "middle right",
+      x: labelled.map(() => right), y: labelled.map((one) => one.edge[0]), text: labelled.map((one) => ` ${one.text}`), textfont: { size: 12 },
+    },
+    {
+      ...points("points", cells, dots), customdata: cells, text: cells.map((k) => hoverText(k + firstPoint())),
+      hoverinfo: "text",
+    },
+    points("bad status", cells.filter(known), ring(15)),
+    points("no value", cells.filter((k) => height[k] === null), { symbol: "x-thin", size: 11, line: { color: colour("text"), width: 2 } }),
+    points("chosen point", [chosenCell()], diamond(20)),
+  ], { title: { text: "1 − α" }, automargin: false }, { title: { text: "packing fraction ν" } }, { showlegend: false, margin: { l: 8, r: 40, t: 8, b: 48 } });
 }
 
-function planeLayout(view) {
-  return chartLayout({
-    xaxis: { title: { text: "1 − α" } },
-    yaxis: { title: { text: "packing fraction ν" } },
-    showlegend: false,
-  });
-}
-
-// A curve of the map through the chosen point: positions along it, the cells (row, column), and the chosen place.
-function curveTraces(view, positions, cells, chosen) {
-  const pick = (field) => cells.map(([row, column]) => (field ? field[row][column] : null));
-  const value = pick(view.value), error = pick(view.error), theory = pick(view.theory);
-  const bad = cells.map(([row, column], k) => (shown(value[k]) && view.status[row][column] !== "ok" ? value[k] : null));
+// A curve of the map through the chosen point: its cells and their places along it.
+function drawCurve(id, cells, places, label, title) {
+  const { view } = chosenView(), pick = (list) => list && cells.map((k) => list[k + firstPoint()]);
+  const [value, error, theory] = [view.scales[0].z, view.error, view.theory].map(pick);
+  const bad = cells.map((k, place) => (data.bad[k + firstPoint()] ? value[place] : null));
+  const chosenPlace = cells.indexOf(chosenCell());
+  const positive = value.filter((v) => v > 0);
+  const dtick = Math.max(...positive) > 1e2 * Math.min(...positive) ? 1 : "D2"; // decades, or also 2 and 5
   const traces = [{
-    type: "scatter", mode: "lines+markers", name: "measured", x: positions, y: value, customdata: cells,
-    text: cells.map(([row, column]) => view.hover(row, column)), hovertemplate: "%{text}<extra></extra>",
-    error_y: { type: "data", array: error, visible: error.some(shown), color: colour("curve"), thickness: 1.2, width: 4 },
-    line: { color: colour("curve"), width: 2 }, marker: { size: 7, color: colour("curve") },
-  }];
-  if (theory.some(shown)) {
-    traces.push({ type: "scatter", mode: "lines", name: "kinetic theory", x: positions, y: theory, line: { color: colour("theory"), dash: "dash", width: 2 }, hovertemplate: "kinetic theory %{y:.6g}<extra></extra>" });
-  }
-  traces.push({ type: "scatter", mode: "markers", name: "status not ok", x: positions, y: bad, marker: RING, hoverinfo: "skip", showlegend: bad.some(shown) });
-  traces.push({ type: "scatter", mode: "markers", name: "chosen point", x: [positions[chosen]], y: [value[chosen]], marker: { symbol: "diamond-open", size: 16, color: "#c05600", line: { width: 3 } }, hoverinfo: "skip", showlegend: false });
-  return traces;
-}
-
-function curveLayout(view, title, label) {
-  const positive = flat(view.value).filter((v) => v > 0);
-  const dtick = Math.max(...positive) > 1e3 * Math.min(...positive) ? 1 : "D2"; // a tick a decade, or also at 2 and 5
-  return chartLayout({
-    xaxis: { title: { text: label } },
-    yaxis: { title: { text: escaped(view.label) }, type: view.log ? "log" : "linear", exponentformat: "power", ...(view.log ? { dtick } : {}) },
-    title: { text: escaped(title), font: { size: 14 }, x: 0.02, xanchor: "left" },
-    showlegend: true,
+    ...SCATTER, mode: "lines+markers", name: "measured", x: places, y: value, customdata: cells,
+    text: cells.map((k) => hoverText(k + firstPoint())), hoverinfo: "text", showlegend: true,
+    error_y: { type: "data", array: error, visible: Boolean(error), thickness: 1.2, width: 4 },
+    line: { color: colour("curve"), width: 2 }, marker: { size: 7 },
+  }, { ...SCATTER, name: "status not ok", x: places, y: bad, marker: ring(15) },
+  { ...SCATTER, name: "chosen point", x: [places[chosenPlace]], y: [value[chosenPlace]], marker: diamond(16) }];
+  if (theory) traces.splice(1, 0, { ...SCATTER, mode: "lines", name: "kinetic theory", x: places, y: theory, line: { color: colour("theory"), dash: "dash" }, showlegend: true });
+  draw(id, traces, { title: { text: label } }, {
+    title: { text: escaped(view.label) }, exponentformat: "power", ...(chosen.log ? { type: "log", dtick } : {}),
+  }, {
+    title: { text: title, font: { size: 14 }, x: 0.02, xanchor: "left" },
     legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 1, xanchor: "right", font: { size: 12 } },
-    margin: { l: 8, r: 8, t: 40, b: 8 },
   });
 }

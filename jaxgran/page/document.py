@@ -12,7 +12,6 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -21,9 +20,9 @@ from jaxgran.files import atomic_write
 from jaxgran.model.checks import InputError
 
 _ESCAPED = {ord(sign): f"\\u{ord(sign):04x}" for sign in "<>&"}
+_FRAME = 'style="width: 100%; height: 1000px; border: 0"'  # of a page in a notebook
 _MARK = re.compile(r"\{\{(\w+)\}\}")
-_DATA = re.compile(r'<script id="data" type="application/json">(.*?)</script>', re.DOTALL)
-_FRAME_HEIGHT = 1000  # pixels, of a page in a notebook
+_SCRIPTS = ("charts.js", "grains.js", "map.js")
 
 
 @dataclass(frozen=True)
@@ -41,56 +40,34 @@ class Page:
         return f"Page({len(self.text) / 1e6:.1f} MB)"
 
     def _repr_html_(self) -> str:
-        frame = f'style="width: 100%; height: {_FRAME_HEIGHT}px; border: 0"'
-        return f'<iframe title="jaxgran" {frame} srcdoc="{html.escape(self.text)}"></iframe>'
+        return f'<iframe title="jaxgran" {_FRAME} srcdoc="{html.escape(self.text)}"></iframe>'
 
 
-def require_plotly() -> None:
-    """Raise an InputError if Plotly is not installed."""
-    try:
-        import plotly.offline  # noqa: F401
-    except ImportError:
-        raise InputError("a page needs Plotly: pip install 'jaxgran[explore]'.") from None
-
-
-def document(name: str, scripts: tuple[str, ...], title: str, data: Mapping[str, Any]) -> Page:
-    """A page from the template ``NAME.html`` beside this file.
+def document(data: Mapping[str, Any]) -> Page:
+    """The page of a map, from the template, the style and the scripts beside this file.
 
     Args:
-      name: of the template.
-      scripts: names of the scripts beside this file, in order.
-      title: of the window.
       data: what the scripts read, in types of JSON.
 
     Raises:
       InputError: (a ValueError) Plotly is not installed.
     """
-    require_plotly()
     parts = {
-        "title": html.escape(title),
+        "title": html.escape(data["title"]),
         "style": _text("page.css"),
         "data": json.dumps(data, separators=(",", ":"), allow_nan=False).translate(_ESCAPED),
         "library": _library(),
-        "script": "\n".join(_text(script) for script in scripts),
+        "script": "\n".join(_text(script) for script in _SCRIPTS),
     }
-    return Page(_MARK.sub(lambda mark: parts[mark[1]], _text(f"{name}.html")))
+    return Page(_MARK.sub(lambda mark: parts[mark[1]], _text("map.html")))
 
 
-def data_of(text: str) -> dict[str, Any] | None:
-    """What the scripts of a page read; None if a text is no page of this program."""
-    found = _DATA.search(text)
-    try:
-        data = json.loads(found[1]) if found else None
-    except json.JSONDecodeError:
-        return None
-    return data if isinstance(data, dict) else None
-
-
-@cache
 def _library() -> str:
     """Plotly in the browser, compressed and as text: a third of its size."""
-    from plotly.offline import get_plotlyjs
-
+    try:
+        from plotly.offline import get_plotlyjs
+    except ImportError:
+        raise InputError("a page needs Plotly: pip install 'jaxgran[explore]'.") from None
     return base64.b64encode(gzip.compress(get_plotlyjs().encode(), mtime=0)).decode()
 
 

@@ -1,78 +1,50 @@
-"""Grains and forces at one instant as a page reads them: small whole numbers, enough for a
-picture.
-"""
+"""The picture of grains and forces of ``flow_figure`` in small whole numbers, for a page."""
 
 import base64
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from matplotlib.colors import to_hex
 
-from jaxgran.plotting.encoding import (
-    BINARY_COLOUR,
-    CLUSTER_COLOUR,
-    GRAIN_EDGE,
-    GRAIN_RAMPS,
-    THINNEST_LINE,
-    WIDEST_LINE,
-    deepest,
-    widest,
-)
+from jaxgran.analysis.contacts import ForceNetwork
+from jaxgran.plotting.encoding import BINARY_COLOUR, CLUSTER_COLOUR, GRAIN_EDGE
+from jaxgran.plotting.flow import COLOURS, bar_images, common_scale, grain_images
 
-MOST_GRAINS = 2**16  # of a picture: their numbers have two bytes
+MOST_GRAINS = 2**16
+"""Grains of a picture on a page."""
+
+PARTS = 2**14
+"""Parts of the side of the window, the unit of lengths on a page."""
+
 ENCODING = {
-    "ramp": GRAIN_RAMPS["speed"],
+    "ramp": [to_hex(COLOURS["speed"](share)) for share in np.linspace(0, 1, 64)],
     "edge": GRAIN_EDGE,
-    "cluster": CLUSTER_COLOUR,
-    "binary": BINARY_COLOUR,
-    "thinnest": THINNEST_LINE,
-    "widest": WIDEST_LINE,
+    "bars": [BINARY_COLOUR, CLUSTER_COLOUR],
+    "parts": PARTS,
 }
 
 
-class Scale(NamedTuple):
-    """The speed of the deepest colour, in σγ̇, and the force of the widest line, in mσγ̇²."""
+def grain_data(network: ForceNetwork) -> dict[str, Any]:
+    """The grains and bars in the window of a picture, and its caption.
 
-    speed: float
-    force: float
-
-
-def scale_of(speed: np.ndarray, force: np.ndarray) -> Scale:
-    """The scale of pictures with these speeds and forces."""
-    return Scale(deepest(speed), widest(force))
-
-
-def grain_data(
-    positions: Float[np.ndarray, "grains 2"],
-    radii: Float[np.ndarray, " grains"],
-    speed: Float[np.ndarray, " grains"],
-    pairs: Int[np.ndarray, "pairs 2"],
-    force: Float[np.ndarray, " pairs"],
-    clustered: Bool[np.ndarray, " pairs"],
-    side: float,
-    tilt: float,
-    scale: Scale,
-) -> dict[str, Any]:
-    """One instant for a page; the arguments are those of a ``ForceNetwork``, and a scale.
-
-    ``data`` has, one after the other and in base64: x and y of the grains in parts of 65536 of the
-    cell, with the tilt taken off x; both grains of each pair (16 bits each); radii, speeds and
-    forces in parts of 255 of the largest radius and of the scale; and whether a pair is in a
-    cluster (8 bits each).
+    ``grains`` has x, y, radii and numbers of colours, one after the other; ``bars`` has x and y of
+    the middles, those of half the branches, widths, and whether a bar is in a cluster. Both are
+    numbers of 16 bits in base64; lengths are in 16384 parts of the side.
     """
-    largest = float(radii.max())
-    x, y = positions.T / side
-    cell = np.floor(np.stack([x - tilt * y, y]) % 1 * 65536)
-    shares = [radii / largest, speed / scale.speed, force / scale.force]
-    parts = [
-        *(part.astype("<u2") for part in (*cell, *pairs.T)),
-        *(np.round(255 * np.clip(share, 0, 1)).astype(np.uint8) for share in shares),
-        clustered.astype(np.uint8),
-    ]
-    numbers = {"side": side, "tilt": tilt, "radius": largest, **scale._asdict()}
+    scale, unit = common_scale([network], "speed"), PARTS / network.side
+    grains, centres = grain_images(network)
+    shares = np.clip(network.speed[grains] / scale.colour, 0, 1) * (len(ENCODING["ramp"]) - 1)
+    pairs, middles, along, widths = bar_images(network, scale.force)
+    bars = [*middles.T * unit, *along.T * unit, widths * unit, network.clustered[pairs]]
     return {
-        "grains": len(radii),
-        "pairs": len(force),
-        **{name: float(f"{number:.6g}") for name, number in numbers.items()},
-        "data": base64.b64encode(b"".join(part.tobytes() for part in parts)).decode(),
+        "grains": _packed([*centres.T * unit, network.radii[grains] * unit, shares]),
+        "bars": _packed(bars),
+        "caption": "Black: forces within clusters of three or more grains. Red: binary collisions. "
+        f"The widest bar is a force of {scale.force:.2g} mσγ̇² or more; all are those of one time "
+        f"step. Blue: peculiar speed, deepest from {scale.colour:.2g} σγ̇. "
+        f"The window is {network.side:.3g} σ wide.",
     }
+
+
+def _packed(columns: list[np.ndarray]) -> str:
+    return base64.b64encode(np.round(columns).astype("<i2").tobytes()).decode()

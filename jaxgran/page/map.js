@@ -1,143 +1,92 @@
-// A page of a map: what is chosen, the controls that choose it, and the address that keeps it.
+// What is chosen, the controls that choose it, and the address that keeps it.
 "use strict";
 
-const [sizes, timesteps, fractions, restitutions] = pageData.axes.map((axis) => axis.values);
-const observables = pageData.observables;
-const names = observables.map((one) => one.name);
-const ratio = observables[names.indexOf("force_ratio")];
-const first = Math.max(names.indexOf("excess"), 0);
+const SWITCHES = { quotient: "over kinetic theory", log: "logarithmic", excess: "excess lines" };
+const listOf = Object.fromEntries(choices.map((choice) => [choice.name, choice.texts]));
 const chosen = {
-  observable: first, grains: sizes.length - 1, timestep: 0, row: fractions.length >> 1, column: restitutions.length >> 1,
-  quotient: false, log: names[first] === "excess" && observables[first].value.some((v) => v > 0), excess: true, levels: 10,
+  observable: 0, packing_fraction: y.length >> 1, restitution: x.length >> 1,
+  grains: listOf.grains.length - 1, timestep: 0, levels: 1,
+  quotient: false, log: observables[0].label === "excess", excess: true,
 };
 
-// Numbers of points: grains, time step, row of ν, column of α; a map without several sizes or time steps has one.
-const pointAt = (row, column) => {
-  const part = Math.max(chosen.grains, 0) * Math.max(timesteps.length, 1) + chosen.timestep;
-  return (part * fractions.length + row) * restitutions.length + column;
-};
-const timestepAt = (point) => plain(timesteps[chosen.timestep]);
-const grainsAt = (point) => pageData.grains?.[point] ?? sizes[Math.max(chosen.grains, 0)];
-const overPlane = (what) => fractions.map((_, row) => restitutions.map((_, column) => what(pointAt(row, column), row, column)));
-const words = (status) => status.replace(/_/g, " ") + (pageData.meanings[status] ? `: ${pageData.meanings[status]}` : "");
+// A cell is a place in the plane; a point also has a number of grains and a time step.
+const part = () => chosen.grains * listOf.timestep.length + chosen.timestep;
+const firstPoint = () => part() * x.length * y.length;
+const chosenCell = () => chosen.packing_fraction * x.length + chosen.restitution;
+const chosenObservable = () => observables[chosen.observable];
 
-// ------------------------------------------------------------------------------------------------------- view
-
-function currentView() {
-  const one = observables[chosen.observable];
-  const quotient = chosen.quotient && one.theory;
-  const divided = (part) => (point) => {
-    const number = one[part][point];
-    return quotient ? (shown(number) && one.theory[point] ? number / one.theory[point] : null) : number;
-  };
-  return {
-    x: restitutions.map((a) => Number((1 - a).toFixed(12))), y: fractions,
-    value: overPlane(divided("value")),
-    error: one.error ? overPlane(divided("error")) : null,
-    theory: one.theory ? overPlane(divided("theory")) : null,
-    status: overPlane((point) => pageData.status[point]),
-    excess: ratio ? overPlane((point) => (shown(ratio.value[point]) ? ratio.value[point] - 1 : null)) : null,
-    hover: (row, column) => hoverText(one, row, column),
-    label: withUnit(one.name.replace(/_/g, " "), quotient ? "" : one.unit) + (quotient ? " / kinetic theory" : ""),
-    row: chosen.row, column: chosen.column, log: chosen.log,
-  };
+function chosenView() {
+  const { views } = chosenObservable();
+  const view = views[Number(chosen.quotient)] ?? views[0];
+  const scale = view.scales[Number(chosen.log)];
+  return { view, scale, levels: scale.levels[part()][chosen.levels] };
 }
 
-function hoverText(one, row, column) {
-  const point = pointAt(row, column);
-  const lines = [
-    `α = ${plain(restitutions[column])}, ν = ${plain(fractions[row])}`,
-    `${one.name.replace(/_/g, " ")} = ${one.text[point]} ${one.unit}`,
-  ];
-  if (one.theory) lines.push(`kinetic theory ${numberText(one.theory[point])}`);
-  if (sizes.length) lines.push(`N = ${grainsAt(point)}${timesteps.length ? `, dt = ${timestepAt(point)}/γ̇` : ""}`);
-  if (one.samples) lines.push(`${numberText(one.samples[point], 3)} effective samples`);
-  lines.push(`status ${pageData.status[point].replace(/_/g, " ")}`);
-  return lines.map(escaped).join("<br>");
-}
-
-// ----------------------------------------------------------------------------------------------------- drawing
-
-function draw() {
-  const view = currentView();
-  const excess = chosen.excess && view.excess && pageData.excessLevels.length ? pageData.excessLevels : null;
-  Plotly.react("plane", planeTraces(view, chosen.levels, excess), planeLayout(view), chartOptions);
-  const alpha = restitutions[chosen.column], nu = fractions[chosen.row];
-  const column = fractions.map((_, row) => [row, chosen.column]), row = restitutions.map((_, k) => [chosen.row, k]);
-  Plotly.react("against-nu", curveTraces(view, fractions, column, chosen.row), curveLayout(view, `α = ${alpha}`, "packing fraction ν"), chartOptions);
-  Plotly.react("against-alpha", curveTraces(view, view.x, row, chosen.column), curveLayout(view, `ν = ${nu}`, "1 − α"), chartOptions);
-  drawPoint(alpha, nu);
-  showControls();
+function show() {
+  const cell = chosenCell(), point = cell + firstPoint();
+  const column = y.map((_, row) => row * x.length + chosen.restitution);
+  const row = x.map((_, k) => chosen.packing_fraction * x.length + k);
+  drawPlane();
+  drawCurve("against-nu", column, y, "packing fraction ν", `α = ${listOf.restitution[chosen.restitution]}`);
+  drawCurve("against-alpha", row, x, "1 − α", `ν = ${listOf.packing_fraction[chosen.packing_fraction]}`);
+  const flow = data.reference.flows[cell], instant = data.instants?.[point];
+  const texts = {
+    which: data.headings[point], status: data.status[point], command: data.again[point],
+    verdict: flow ? flow.verdict : data.reference.outside,
+    "grains-caption": instant ? instant.caption : "This point has no picture.",
+  };
+  for (const [id, text] of Object.entries(texts)) element(id).textContent = text;
+  element("status").classList.toggle("bad", data.bad[point]);
+  fillTable("numbers", tableRows(point), observables.map((one) => one.meaning));
+  fillTable("verdict-numbers", flow ? [data.reference.columns, ...flow.rows] : []);
+  element("again").hidden = !data.again[point];
+  element("grains-part").hidden = !data.instants;
+  element("grains").hidden = !instant;
+  if (instant) drawGrains(element("grains"), instant);
+  for (const name of Object.keys(chosen)) element(`choose-${name}`)[name in SWITCHES ? "checked" : "value"] = chosen[name];
+  element("choose-quotient").disabled = chosenObservable().views.length < 2;
   keepAddress();
 }
 
-function drawPoint(alpha, nu) {
-  const point = pointAt(chosen.row, chosen.column);
-  const which = [`α = ${alpha}`, `ν = ${nu}`];
-  if (sizes.length) which.push(`N = ${grainsAt(point)}`);
-  if (timesteps.length) which.push(`dt = ${timestepAt(point)}/γ̇`);
-  element("which").textContent = which.join(", ");
-  element("status").textContent = `Status ${words(pageData.status[point])}.`;
-  element("status").classList.toggle("bad", pageData.status[point] !== "ok");
-  fillTable(element("numbers"), COLUMNS, tableRows(observables, point), observables.map((one) => one.meaning));
-  const { flows, columns, outside } = pageData.reference, flow = flows[chosen.row * restitutions.length + chosen.column];
-  element("verdict").textContent = flow ? flow.verdict : outside;
-  element("verdict-part").hidden = !flow;
-  fillTable(element("verdict-numbers"), columns, flow?.rows ?? []);
-  const command = commandAgain(point, alpha, nu);
-  element("again").hidden = !command;
-  element("command").textContent = command;
-  const instant = pageData.instants?.[point];
-  element("grains-part").hidden = !pageData.instants;
-  element("grains").hidden = !instant;
-  element("grains-caption").textContent = instant ? grainCaption(instant) : "This point has no instant.";
-  if (instant) drawGrains(element("grains"), instant, pageData.encoding);
+const tableRows = (point) => [data.columns, ...observables.map((one) => [one.label, ...one.texts.map((texts) => texts?.[point] ?? "")])];
+
+function fillTable(id, rows, meanings = []) {
+  const table = element(id);
+  table.replaceChildren();
+  table.parentElement.hidden = !rows.length;
+  rows.forEach((cells, k) => {
+    const line = (k ? table.tBodies[0] ?? table.createTBody() : table.createTHead()).insertRow();
+    line.title = meanings[k - 1] ?? "";
+    cells.forEach((text, place) => {
+      const cell = document.createElement(k && place ? "td" : "th");
+      cell.textContent = text;
+      line.append(cell);
+    });
+  });
 }
-
-// Four times the strain halves the standard error.
-function commandAgain(point, alpha, nu) {
-  const again = pageData.again;
-  if (!again || !sizes.length || !timesteps.length || !again.strain[point]) return "";
-  const strain = Number((4 * again.strain[point]).toPrecision(3));
-  return `jaxgran map --restitution ${alpha} --packing-fraction ${nu} --grains ${grainsAt(point)} --seeds ${again.seeds}` +
-    ` --timestep ${timestepAt(point)} --strain ${strain} ${again.options} --output point.nc`;
-}
-
-// ---------------------------------------------------------------------------------------------------- controls
-
-const CHOICES = { observable: names, grains: sizes, timestep: timesteps, row: fractions, column: restitutions };
-const SWITCHES = ["quotient", "log", "excess"];
 
 function fillControls() {
-  const texts = { observable: observables.map((one) => withUnit(one.name.replace(/_/g, " "), one.unit)) };
-  for (const [name, values] of Object.entries(CHOICES)) {
-    const select = element(`choose-${name}`);
-    values.forEach((value, k) => {
-      const option = document.createElement("option");
-      option.value = k;
-      option.textContent = texts[name] ? texts[name][k] : plain(value);
-      select.append(option);
+  const add = (name, control, text, before) => {
+    const label = document.createElement("label");
+    control.id = `choose-${name}`;
+    label.append(...(before ? [text, control] : [control, ` ${text}`]));
+    element("controls").append(label);
+    control.addEventListener("change", () => {
+      chosen[name] = name in SWITCHES ? control.checked : Number(control.value);
+      show();
     });
-    select.parentElement.hidden = values.length < 2 && ["grains", "timestep"].includes(name);
-    select.addEventListener("change", () => { chosen[name] = Number(select.value); draw(); });
+    return label;
+  };
+  for (const { name, label, texts } of choices) {
+    const select = document.createElement("select");
+    select.append(...texts.map((text, k) => new Option(text, k)));
+    add(name, select, label, true).hidden = texts.length < 2;
   }
-  for (const name of SWITCHES) {
-    element(`choose-${name}`).addEventListener("change", (event) => { chosen[name] = event.target.checked; draw(); });
+  for (const [name, text] of Object.entries(SWITCHES)) {
+    const box = document.createElement("input");
+    box.type = "checkbox";
+    add(name, box, text, false).hidden = name === "excess" && !data.excess.length;
   }
-  element("choose-levels").addEventListener("input", (event) => { chosen.levels = Number(event.target.value); draw(); });
-}
-
-function showControls() {
-  for (const name of Object.keys(CHOICES)) element(`choose-${name}`).value = chosen[name];
-  for (const name of SWITCHES) element(`choose-${name}`).checked = chosen[name];
-  element("choose-levels").value = chosen.levels;
-  element("choose-quotient").disabled = !observables[chosen.observable].theory;
-  element("choose-excess").parentElement.hidden = !ratio;
-}
-
-function chooseCell(cell) {
-  [chosen.row, chosen.column] = cell;
-  draw();
 }
 
 // Arrow keys move the chosen point over the plane: to the right is a smaller α, upwards a larger ν.
@@ -145,70 +94,60 @@ function moveByKey(event) {
   const step = { ArrowUp: [1, 0], ArrowDown: [-1, 0], ArrowLeft: [0, 1], ArrowRight: [0, -1] }[event.key];
   if (!step) return;
   event.preventDefault();
-  const within = (k, list) => Math.min(Math.max(k, 0), list.length - 1);
-  chooseCell([within(chosen.row + step[0], fractions), within(chosen.column + step[1], restitutions)]);
+  ["packing_fraction", "restitution"].forEach((name, k) => {
+    chosen[name] = Math.min(Math.max(chosen[name] + step[k], 0), listOf[name].length - 1);
+  });
+  show();
 }
 
-// ----------------------------------------------------------------------------------------------------- address
-
-const inAddress = (value) => (typeof value === "number" ? plain(value) : value);
-
 function keepAddress() {
-  const kept = new URLSearchParams();
-  for (const [name, values] of Object.entries(CHOICES)) if (values.length) kept.set(name, inAddress(values[chosen[name]]));
-  for (const name of SWITCHES) kept.set(name, chosen[name] ? "yes" : "no");
-  kept.set("levels", chosen.levels);
-  if (location.hash.slice(1) === kept.toString()) return;
+  const kept = Object.entries(chosen).map(([name, value]) => [name, listOf[name]?.[value] ?? value]);
   try {
-    history.replaceState(null, "", `#${kept}`);
+    history.replaceState(null, "", `#${new URLSearchParams(kept)}`);
   } catch { /* a page inside a notebook has no address of its own */ }
 }
 
 function readAddress() {
-  const kept = new URLSearchParams(location.hash.slice(1));
-  for (const [name, values] of Object.entries(CHOICES)) {
-    const place = values.map(inAddress).indexOf(kept.get(name));
-    if (place >= 0) chosen[name] = place;
+  for (const [name, text] of new URLSearchParams(location.hash.slice(1))) {
+    if (name in SWITCHES) chosen[name] = text === "true";
+    else if (listOf[name]?.includes(text)) chosen[name] = listOf[name].indexOf(text);
   }
-  for (const name of SWITCHES) if (kept.has(name)) chosen[name] = kept.get(name) === "yes";
-  const levels = Number(kept.get("levels"));
-  if (levels >= 2 && levels <= 30) chosen.levels = Math.round(levels);
 }
 
-// ------------------------------------------------------------------------------------------------------- start
+function offerCopy(id, text) {
+  element(id).addEventListener("click", async ({ target }) => {
+    const label = target.textContent;
+    await navigator.clipboard.writeText(text());
+    target.textContent = "Copied";
+    setTimeout(() => (target.textContent = label), 1500);
+  });
+}
 
-function startMap() {
-  element("title").textContent = pageData.title;
-  const belongs = [];
-  if (sizes.length) belongs.push(pageData.grains ? `N chosen by point, up to ${sizes[0]}` : `N = ${sizes.join(", ")}`);
-  if (timesteps.length) belongs.push(`dt = ${timesteps.map(plain).join(", ")}/γ̇`);
-  if (pageData.about) belongs.push(pageData.about);
-  element("about").textContent = `${belongs.join(", ")}. Error bars are one standard error of sampling. ` +
-    `${ratio ? "The excess is the force ratio − 1. " : ""}Choose a point by a click, or with the arrow keys.`;
-  element("verdict-about").textContent = pageData.reference.about;
-  element("notes").replaceChildren(...pageData.notes.map((note) => {
-    const line = document.createElement("p");
-    line.textContent = note;
-    return line;
-  }));
+async function start() {
+  for (const id of ["title", "about", "notes"]) element(id).textContent = data[id];
+  element("verdict-about").textContent = data.reference.about;
   fillControls();
   readAddress();
-  draw();
+  await loadPlotly();
+  show();
   for (const id of ["plane", "against-nu", "against-alpha"]) {
-    element(id).on("plotly_click", (event) => {
-      const hit = event.points.find((point) => point.customdata);
-      if (hit) chooseCell(hit.customdata);
+    element(id).on("plotly_click", ({ points }) => {
+      const cell = points.find((point) => point.customdata !== undefined)?.customdata;
+      if (cell === undefined) return;
+      [chosen.packing_fraction, chosen.restitution] = [Math.floor(cell / x.length), cell % x.length];
+      show();
     });
   }
   element("plane").addEventListener("keydown", moveByKey);
-  element("copy-numbers").addEventListener("click", (event) => {
-    const rows = tableRows(observables, pointAt(chosen.row, chosen.column));
-    copyText([COLUMNS, ...rows].map((cells) => cells.join("\t")).join("\n"), event.target);
-  });
-  element("copy-command").addEventListener("click", (event) => copyText(element("command").textContent, event.target));
-  addEventListener("hashchange", () => { readAddress(); draw(); });
-  addEventListener("resize", () => drawPoint(restitutions[chosen.column], fractions[chosen.row]));
-  whenSchemeChanges(draw);
+  offerCopy("copy-numbers", () => tableRows(chosenCell() + firstPoint()).map((cells) => cells.join("\t")).join("\n"));
+  offerCopy("copy-command", () => element("command").textContent);
+  addEventListener("hashchange", () => { readAddress(); show(); });
+  addEventListener("resize", show);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", show);
+  document.body.dataset.ready = "yes";
 }
 
-startPage(startMap);
+start().catch((error) => {
+  element("about").textContent = `The page could not be shown (it needs a browser of 2023 or later). ${error.message}`;
+  throw error;
+});

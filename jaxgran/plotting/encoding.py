@@ -14,10 +14,8 @@ GRAIN_RAMPS = {
 GRAIN_EDGE = "#8c8c8c"
 CLUSTER_COLOUR = "#1a1a1a"
 BINARY_COLOUR = "#e0552f"
-WIDEST_LINE = 5.0  # points, line of the largest force
-THINNEST_LINE = 0.35  # points, line of the smallest force
 COLOUR_SHARE = 0.98  # of the grains below the deepest colour
-WIDTH_SHARE = 0.95  # of the forces below the widest line
+WIDTH_SHARE = 0.95  # of the forces below the widest bar
 
 
 def deepest(values: np.ndarray) -> float:
@@ -26,7 +24,7 @@ def deepest(values: np.ndarray) -> float:
 
 
 def widest(forces: np.ndarray) -> float:
-    """The force of the widest line."""
+    """The force of the widest bar."""
     return _quantile(forces, WIDTH_SHARE)
 
 

@@ -158,23 +158,42 @@ def draw_flow(axes: Axes, network: ForceNetwork, colour: Colour, scale: Scale) -
 
 def show_flow(artists: Artists, network: ForceNetwork, colour: Colour, scale: Scale) -> None:
     """Show another instant of a flow by artists that are there."""
-    which, places = _images(network, network.positions, network.radii)
+    which, places = grain_images(network)
     sizes = 2 * network.radii[which]
     artists.grains.set(widths=sizes, heights=sizes, angles=0 * sizes, offsets=places)
     artists.grains.set_array(_values(network, colour)[which])
-    i, j = network.positions[network.pairs.T]
-    branches = minimum_image(i - j, network.side, network.tilt)
-    lengths = np.linalg.norm(branches, axis=-1)
-    widths = np.clip(WIDEST_BAR * network.force / scale.force, THINNEST_BAR, WIDEST_BAR)
-    pairs, middles = _images(network, j + branches / 2, lengths / 2 + widths)
-    along = branches[pairs] / 2
-    across = along[:, ::-1] * [-1, 1] * (widths / lengths)[pairs, None]
-    tip = along * (1 + widths / lengths)[pairs, None]  # fills the corner to the next bar
+    pairs, middles, along, widths = bar_images(network, scale.force)
+    extension = (widths / np.linalg.norm(2 * along, axis=-1))[:, None]
+    across = along[:, ::-1] * [-1, 1] * extension
+    tip = along * (1 + extension)  # fills the corner to the next bar
     corners = [along + across, tip, along - across, -along - across, -tip, -along + across]
     bars = middles[:, None] + np.stack(corners, axis=1)
     in_clusters = network.clustered[pairs]
     artists.clusters.set_verts(list(bars[in_clusters]))
     artists.binaries.set_verts(list(bars[~in_clusters]))
+
+
+def grain_images(network: ForceNetwork) -> tuple[np.ndarray, np.ndarray]:
+    """The grains in the window, with those cut at an edge at both: indices (images,) and centres
+    (images, 2) in σ.
+    """
+    return _images(network, network.positions, network.radii)
+
+
+def bar_images(network: ForceNetwork, force: float) -> tuple[np.ndarray, ...]:
+    """The bars in the window: indices of pairs (images,), middles and half branches (images, 2),
+    and widths (images,), in σ.
+
+    Args:
+      network: grains and forces.
+      force: the force of the widest bar, in mσγ̇².
+    """
+    i, j = network.positions[network.pairs.T]
+    branches = minimum_image(i - j, network.side, network.tilt)
+    widths = np.clip(WIDEST_BAR * network.force / force, THINNEST_BAR, WIDEST_BAR)
+    reach = np.linalg.norm(branches, axis=-1) / 2 + widths
+    pairs, middles = _images(network, j + branches / 2, reach)
+    return pairs, middles, branches[pairs] / 2, widths[pairs]
 
 
 def _images(
