@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks.process import ROOT, set_up
 from benchmarks.registry import BENCHMARKS, Benchmark
 
-SHARED = ("name", "quick", "output", "allow_uncommitted")
+SHARED = ("name", "quick", "output", "replace")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -28,11 +28,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     benchmark = next((one for one in BENCHMARKS if one.name == chosen.name), None)
     set_up(benchmark is not None and benchmark.one_core)
-    from benchmarks.output import Output, refusal
+    from benchmarks.output import RESULTS, Output, refusal
 
-    if not (chosen.quick or chosen.allow_uncommitted) and (why := refusal()):
-        print(f"{chosen.name}: {why}", file=sys.stderr)
-        raise SystemExit(2)
+    if chosen.replace:
+        if why := refusal(chosen.quick):
+            print(f"{chosen.name}: {why}", file=sys.stderr)
+            raise SystemExit(2)
+        chosen.output = RESULTS
     if benchmark is None:
         raise SystemExit(run_all(chosen))
     options = {
@@ -56,11 +58,7 @@ def run_all(chosen: argparse.Namespace) -> int:
     output.mkdir(parents=True, exist_ok=True)
     ledger = output / ".all"
     done = set(ledger.read_text().splitlines()) if ledger.exists() else set()
-    flags = [
-        f"--{name.replace('_', '-')}"
-        for name in ("quick", "allow_uncommitted")
-        if getattr(chosen, name)
-    ]
+    flags = [f"--{name}" for name in ("quick", "replace") if getattr(chosen, name)]
     failed = 0
     for benchmark in BENCHMARKS:
         note = f"{state} {benchmark.name}"
@@ -108,14 +106,17 @@ def parser() -> argparse.ArgumentParser:
     shared.add_argument(
         "--quick", action="store_true", help="small and inaccurate, into files named _quick"
     )
-    default = ROOT / "benchmarks" / "results"
     shared.add_argument(
-        "--output", type=Path, default=default, help="folder [default: benchmarks/results]"
+        "--output",
+        type=Path,
+        default=ROOT / "benchmarks" / "scratch",
+        help="folder [default: benchmarks/scratch, which is not committed]",
     )
     shared.add_argument(
-        "--allow-uncommitted",
+        "--replace",
         action="store_true",
-        help="write results although the tree has uncommitted changes",
+        help="replace the committed results in benchmarks/results; the tree must have no "
+        "uncommitted changes, so that each result names a commit that exists",
     )
     about = "run all of them, one after the other; a second call goes on where the first one ended"
     names.add_parser("all", parents=[shared], help=about, description=about)
@@ -125,7 +126,10 @@ def parser() -> argparse.ArgumentParser:
         "pictures", nargs="*", metavar="PICTURE", help="name without .png [default: all]"
     )
     draw.add_argument(
-        "--output", type=Path, default=default, help="folder [default: benchmarks/results]"
+        "--output",
+        type=Path,
+        default=ROOT / "benchmarks" / "results",
+        help="folder [default: benchmarks/results]",
     )
     for benchmark in BENCHMARKS:
         one = names.add_parser(

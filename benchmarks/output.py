@@ -41,17 +41,17 @@ def rounded(value: Any, digits: int) -> Any:
     return float(f"{value:.{digits}g}") if isinstance(value, float) else value
 
 
-def refusal() -> str | None:
-    """Why a full run would write results that no commit stands for, and what to do; None where it
-    would not.
-    """
+def refusal(quick: bool) -> str | None:
+    """Why the committed results cannot be replaced, and what to do; None where they can."""
+    if quick:
+        return "a quick run replaces no results: leave out --quick or --replace."
     changed = uncommitted()
     if not changed:
         return None
     others = f" and {len(changed) - 1} more" if changed[1:] else ""
     return (
-        f"the tree has uncommitted changes ({changed[0]}{others}): commit them, or add --quick "
-        "or --allow-uncommitted."
+        f"the tree has uncommitted changes ({changed[0]}{others}): commit them, or leave out "
+        "--replace."
     )
 
 
@@ -80,6 +80,11 @@ class Output:
     folder: Path
     quick: bool
     hardware: dict[str, str | int] = field(default_factory=hardware)
+
+    @property
+    def replaces(self) -> bool:
+        """Whether the committed results are replaced."""
+        return self.folder == RESULTS and not self.quick
 
     def path(self, name: str, ending: str) -> Path:
         """The file of a name and an ending, such as ``stability`` and ``_variants.png``; its folder

@@ -1,12 +1,10 @@
-"""Measured numbers of a page, filled in from ``benchmarks/results`` when the site is built.
+"""Measured numbers of pages, filled in from ``benchmarks/results``, and tables read from the code.
 
-A page is a Jinja template. ``{{ pm(row.value, row.error) }}`` stands for a value with its standard
-error, and a loop over the rows of a result makes a table, so that neither can differ from the file.
-A name that a file does not have stops the build. Markdown needs braces for itself: comments of
-Jinja are ``{=# … #=}``.
-
-The README and the paper are filled in from ``docs/_build`` and committed, since they are read where
-no site is built:
+A page with numbers is made from a Jinja template in ``docs/_build`` and committed, so that it reads
+the same in the repository and on the site. ``{{ pm(row.value, row.error) }}`` stands for a value
+with its standard error, a loop over the rows of a result makes a table, and so neither can differ
+from the file; a test says when a page is stale. Markdown needs braces for itself: comments of Jinja
+are ``{=# … #=}``.
 
     python -m benchmarks.pages
 """
@@ -24,6 +22,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from benchmarks import page_tables
 from benchmarks.output import RESULTS, ROOT
 from benchmarks.peers import front
 from benchmarks.solvers.groups import GROUPS
@@ -33,10 +32,15 @@ from jaxgran.maps.schema import shear_stress_ratio
 from jaxgran.model.display import with_error
 from jaxgran.reference.table import FACTORS
 
-TEMPLATES = {
+BUILD = ROOT / "docs" / "_build"
+TEMPLATES = {  # of committed pages
     "README.md": "docs/_build/README.md",
     "docs/paper/paper.md": "docs/_build/paper.md",
-}  # of committed pages
+    **{
+        f"docs/{path.relative_to(BUILD / 'pages').as_posix()}": path.relative_to(ROOT).as_posix()
+        for path in sorted((BUILD / "pages").rglob("*.md"))
+    },
+}
 
 
 class Results:
@@ -316,6 +320,13 @@ for _functions in (
     ),
 ):
     ENVIRONMENT.globals |= {one.__name__: one for one in _functions}
+ENVIRONMENT.globals |= {
+    name: getattr(page_tables, name)
+    for name in (
+        *("observables", "variables", "coordinates", "options"),
+        *("examples", "benchmarks", "notebooks"),
+    )
+}
 
 
 def filled(page: str) -> str:

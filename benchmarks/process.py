@@ -25,5 +25,5 @@ def set_up(one_core: bool) -> None:
 
 def printed_by(name: str, *options: str) -> str:
     """What a benchmark prints in a process of its own, with options that make it write nothing."""
-    command = [sys.executable, "-m", "benchmarks", name, "--allow-uncommitted", *options]
+    command = [sys.executable, "-m", "benchmarks", name, *options]
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, cwd=ROOT).stdout

@@ -12,7 +12,7 @@ Then the intervals are judged: on points of the map that are left out, and on th
 force ratio at other time steps.
 
     python -m benchmarks reference          # from benchmarks/results/reference.nc, in two minutes
-    python -m benchmarks reference --quick  # into files named _quick and a folder of the output
+    python -m benchmarks reference --replace  # and into jaxgran/reference
 """
 
 import json
@@ -65,7 +65,7 @@ def run(output: Output) -> None:
     """Make the table, judge its intervals, draw the figure, and write ``reference`` as JSON and
     PNG.
     """
-    folder = output.folder / "reference_quick" if output.quick else FOLDER
+    folder = FOLDER if output.replaces else output.folder / "reference"
     folder.mkdir(parents=True, exist_ok=True)
     others = [jg.open_map(RESULTS / name) for name in OTHERS]
     made_from = {"map": SOURCE, "table commit": output.hardware["commit"]}
@@ -322,7 +322,9 @@ def judged(table: Table, rows: list[dict[str, Any]]) -> Any:
 
 
 def coverage(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
-    """Share of the fresh flows within both intervals, mean and rms difference."""
+    """Share of the fresh flows within both intervals, mean and rms difference, and its rms in units
+    of the standard error.
+    """
     found = {}
     for name in MEASURED:
         apart, narrow, whole = (
@@ -333,6 +335,9 @@ def coverage(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
             "covered_narrow": round(float(np.mean(np.abs(apart) < narrow)), 3),
             "mean": round(float(np.mean(apart)), 4),
             "rms": round(float(np.sqrt(np.mean(apart**2))), 4),
+            "rms_in_standard_errors": round(
+                HALF_INTERVAL * float(np.sqrt(np.mean((apart / narrow) ** 2))), 3
+            ),
             "median_half_width": round(float(np.median(whole)), 4),
         }
     return found

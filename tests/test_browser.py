@@ -126,7 +126,7 @@ def test_table_and_curves_have_the_numbers_of_the_file(page) -> None:
     point = at.sel(packing_fraction=0.6)
     text, theory, *_ = row_of(page, "pressure (m/t²)")
     assert text == with_error(float(point.pressure), float(point.pressure_stderr))
-    assert float(theory) == pytest.approx(float(point["theory/pressure"]), rel=5e-6)
+    assert float(theory) == pytest.approx(float(point["theory/pressure"]), rel=5e-4)
     measured = trace(page, "against-nu", "measured")
     np.testing.assert_allclose(measured["y"], at.pressure, rtol=5e-7)
     np.testing.assert_allclose(measured["error_y"]["array"], at.pressure_stderr, rtol=5e-7)

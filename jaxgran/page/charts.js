@@ -85,7 +85,7 @@ function drawPlane() {
     points("bad status", cells.filter(known), ring(15)),
     points("no value", cells.filter((k) => height[k] === null), { symbol: "x-thin", size: 11, line: { color: colour("text"), width: 2 } }),
     points("chosen point", [chosenCell()], diamond(20)),
-  ], { title: { text: "1 − α" }, automargin: false }, { title: { text: "packing fraction ν" } }, { showlegend: false, margin: { l: 8, r: 40, t: 8, b: 48 } });
+  ], { title: { text: "1 − α", standoff: 36 } }, { title: { text: "packing fraction ν" } }, { showlegend: false, margin: { l: 8, r: 40, t: 8, b: 56 } });
 }
 
 // A curve of the map through the chosen point: its cells and their places along it.

@@ -106,7 +106,7 @@ def _observable(
         views.append(_view(data, f"{words} / kinetic theory", quotient, quotients, False))
     texts = [
         _texts(value, error),
-        _texts(theory),
+        _texts(theory, digits=4),
         _texts(_effective_samples(data, label), digits=3),
         _texts(large, known(f"{name}_large_system_ci95")),
     ]

@@ -1,0 +1,142 @@
+"""Tables of pages that are read from the code: observables, variables of a map, options, examples,
+benchmarks and notebooks.
+"""
+
+import ast
+import importlib
+import inspect
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from benchmarks.output import ROOT
+from benchmarks.registry import BENCHMARKS
+from jaxgran.cli.options import option_name, with_options
+from jaxgran.maps.dataset import map_dataset
+from jaxgran.maps.schema import path_of
+from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.settings import options as parameters
+from jaxgran.maps.variables import COORDINATES, VARIABLES
+from jaxgran.sampling.observables import OBSERVABLES, Observables
+
+
+def observables() -> str:
+    """A table of what is measured."""
+    rows = ["| name | unit | group in the file of a map | meaning |", "| --- | --- | --- | --- |"]
+    for name, row in OBSERVABLES.items():
+        group = "root" if row.group == "/" else row.group
+        rows.append(f"| `{name}` | {unit_of(row.unit)} | {group} | {row.meaning} |")
+    return "\n".join(rows)
+
+
+def unit_of(unit: str | None) -> str:
+    return "–" if unit in ("1", None) else unit
+
+
+def variables(group: str) -> str:
+    """A table of the variables of a group of a map, with the formulas of averages and the names of
+    their errors.
+    """
+    rows = {row.path.rpartition("/")[2]: row for row in VARIABLES if row.group == group}
+    data = map_dataset(MapSettings((0.5,), (0.6,), timestep=1e-3), {}, {})
+    names = map(str, data[group].data_vars) if group == "/" or group in data.children else ()
+    endings: dict[str, list[str]] = {name: [] for name in rows}
+    for name in names:
+        if name not in rows:
+            owner = max((row for row in rows if name.startswith(row)), key=len)
+            endings[owner].append(f"`{name.removeprefix(owner)}`")
+    lines = [
+        "| name | dimensions | unit | meaning | formula | errors |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for name, row in rows.items():
+        formula = (
+            f"`{formulas()[name]}`" if path_of(name) == row.path and name in OBSERVABLES else ""
+        )
+        dims, errors = ", ".join(f"`{dim}`" for dim in row.dims), ", ".join(endings[name])
+        cells = f"`{name}`", dims, unit_of(row.unit), row.meaning, formula, errors
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def formulas() -> dict[str, str]:
+    """The formulas of the observables as they are written in their table."""
+    (table,) = ast.parse(inspect.getsource(Observables)).body
+    rows = {
+        row.targets[0].id: row.value.args[1].body
+        for row in table.body
+        if isinstance(row, ast.Assign)
+    }
+    return {name: re.sub(r"\b(s|xp)\.", "", ast.unparse(formula)) for name, formula in rows.items()}
+
+
+def coordinates() -> str:
+    """A table of the coordinates of a map."""
+    lines = ["| coordinate | unit | meaning |", "| --- | --- | --- |"]
+    for name, about in COORDINATES.items():
+        lines.append(f"| `{name}` | {unit_of(about.get('units'))} | {about['long_name']} |")
+    return "\n".join(lines)
+
+
+def table_of(command: str, kind: str) -> Any:
+    """A constant of the command line, such as ``MAP_OPTIONS``."""
+    module = "map" if command == "plot" else command
+    return getattr(importlib.import_module(f"jaxgran.cli.{module}"), f"{command.upper()}_{kind}")
+
+
+def options(command: str) -> str:
+    """A table of the options of a command."""
+    rows = ["| option | meaning | default |", "| --- | --- | --- |"]
+    for name, one in table_of(command, "OPTIONS").items():
+        flag = f"-{one.short}, {option_name(name)}" if one.short else option_name(name)
+        meaning = with_options(one.help, parameters(command)) + (
+            f" In {one.unit}." if one.unit else ""
+        )
+        if isinstance(one.kind, tuple):
+            flag, meaning = (
+                f"{flag} NAME",
+                (f"{meaning} One of {', '.join(f'`{choice}`' for choice in one.kind)}."),
+            )
+        elif one.kind is not bool:
+            flag = f"{flag} {one.placeholder}".replace("|auto", " or auto")
+        elif one.off:
+            flag = f"{flag}, --no-{name}"
+        rows.append(f"| `{flag}` | {meaning} | {one.default or '–'} |")
+    return "\n".join(rows)
+
+
+def examples(command: str) -> str:
+    """The examples of a command."""
+    lines = [
+        f"# {meaning}\n{example}" for meaning, example in table_of(command, "EXAMPLES").items()
+    ]
+    return "\n".join(["```shell", *lines, "```"])
+
+
+def notebooks() -> str:
+    """The notebooks by their titles, as a list of links from a page in ``docs``."""
+    return "\n".join(
+        f"- [{title_of(path)}](../notebooks/{path.name})"
+        for path in sorted((ROOT / "notebooks").glob("*.ipynb"))
+    )
+
+
+def title_of(notebook: Path) -> str:
+    """The first line of a notebook."""
+    first = json.loads(notebook.read_text(encoding="utf-8"))["cells"][0]["source"]
+    return "".join(first).split("\n", 1)[0].lstrip("# ")
+
+
+def benchmarks() -> str:
+    """A table of all benchmarks, with links from a page in a folder of ``docs``."""
+    rows = ["| question | command: `python -m benchmarks` | minutes, in full and quick | figures |"]
+    rows.append("| --- | --- | --- | --- |")
+    for one in BENCHMARKS:
+        drawn = [name.removesuffix(".png") for name in one.files if name.endswith(".png")]
+        figures = (
+            ", ".join(f"[{name}](../../benchmarks/results/{name}.png)" for name in drawn) or "–"
+        )
+        full, quick = one.minutes
+        rows.append(f"| {one.question} | `{one.name}` | {full:g}, {quick:g} | {figures} |")
+    return "\n".join(rows)
