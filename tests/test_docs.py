@@ -69,7 +69,7 @@ def test_tests_that_pages_name_are_there() -> None:
 # Names of other programs and of examples, and endings of files
 FOREIGN = """ConstantMomentum NO_MKDOCS_2_WARNING as cell_size_too_small css csv data_columns
     dev dirty h5 hdf5 import install-completion jaxgran_map js lammpstrj lees_edwards
-    lint-imports lowest mp4 nc ncdump no-caption False null pandas pure_callback pyplot pyright
+    lint-imports lowest mp4 nc ncdump no-caption no-snapshots or False null pandas pure_callback pyplot pyright
     pytest_cache read_csv select show-completion simulate src tcp tsv txt vjp"""
 PLACEHOLDERS = (
     "ADDRESS COMMAND DT FACTOR FILE FOLDER LIST NAME NUMBER PRESET RULE STRAIN STRESS TAU TOL"
@@ -98,7 +98,8 @@ def names_of_the_project() -> set[str]:
     for path in [*SOURCES, *files]:
         names.update(path.relative_to(ROOT).parts, [path.stem])
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            names.update(x for field in _FIELDS if isinstance(x := getattr(node, field, None), str))
+            texts = [x for field in _FIELDS if isinstance(x := getattr(node, field, None), str)]
+            names.update(part for text in texts for part in (text, *text.split("/")))
     with netCDF4.Dataset(ROOT / "benchmarks" / "results" / "paper.nc") as data:
         for group in (data, *data.groups.values()):
             names.update(group.variables, group.dimensions, group.ncattrs(), [group.name])
