@@ -54,14 +54,14 @@ def ratio(flow: dict, curve: str) -> str:
     if not ours.reached:
         return "–"
     sign = "" if theirs.reached else "> "
-    return f"{sign}{float(f'{theirs.row[COST] / ours.row[COST]:.2g}'):,g}"
+    return f"{sign}{_two_digits(theirs.row[COST] / ours.row[COST])}"
 
 
 def table(flows: list[dict]) -> str:
     """Markdown: for each flow the cheapest setting of each program, its microseconds for a grain
     and a unit of strain, and its time over jaxgran's at overlaps no deeper.
     """
-    heads = "α, ν", "program", "setting", "µs", "error of p", "of τ", "overlap (σ)", "over jaxgran"
+    heads = "α, ν", "program", "setting", "µs", "over jaxgran", "error of p", "of τ", "overlap (σ)"
     lines = [f"| {' | '.join(heads)} |", "| --- |" + " --- |" * (len(heads) - 1)]
     for flow in flows:
         where = f"{flow['restitution']:g}, {flow['packing_fraction']:g}"
@@ -70,16 +70,12 @@ def table(flows: list[dict]) -> str:
             if found is None:
                 lines.append(f"| {where} | {curve} | – | it collapses | – | – | – | – |")
                 continue
-            row = found.row
-            cells = [f"{100 * e:+.1f} ± {100 * s:.1f} %" for e, s in map(tuple, _errors(row))]
-            cost = 1e6 * row[COST] / flow["discs"]
+            errors = [f"{100 * e:+.1f} ± {100 * s:.1f} %" for e, s in _errors(found.row)]
+            cost = _two_digits(1e6 * found.row[COST] / flow["discs"])
             over = "1" if curve == "jaxgran" else ratio(flow, curve)
-            setting = {"LAMMPS": "k = ", "event-driven": "– "}.get(curve, "dt = ")
-            setting += "" if curve == "event-driven" else f"{row['setting']:.0e}"
-            lines.append(
-                f"| {where} | {curve} | {setting.strip()} | {cost:.2g} | {cells[0]} | {cells[1]} | "
-                f"{row['largest_overlap']:.2g} | {over} |"
-            )
+            overlap = _two_digits(found.row["largest_overlap"])
+            cells = where, curve, _setting(curve, found.row), cost, over, *errors, overlap
+            lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -94,3 +90,16 @@ def _largest_error(row: dict) -> float:
 def _misses(row: dict) -> bool:
     """Whether an error exceeds the target by more than twice its standard error."""
     return any(abs(error) - 2 * noise > TARGET for error, noise in _errors(row))
+
+
+def _two_digits(value: float) -> str:
+    return f"{float(f'{value:.2g}'):,g}"
+
+
+def _setting(curve: str, row: dict) -> str:
+    """The time step or the stiffness of a row."""
+    if curve == "event-driven":
+        return "–"
+    return f"{'k' if curve == 'LAMMPS' else 'dt'} = {row['setting']:.0e}".replace(
+        "e-0", "e-"
+    ).replace("e+0", "e")
