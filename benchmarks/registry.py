@@ -256,7 +256,7 @@ BENCHMARKS = (
     Benchmark(
         "stability",
         "Where do methods fail, from loose and elastic to dense and dissipative flows?",
-        (40, 2),
+        (30, 2),
         ("stability.json", "stability.png"),
         one_core=True,
     ),
