@@ -69,8 +69,8 @@ def test_tests_that_pages_name_are_there() -> None:
 # Names of other programs and of examples, and endings of files
 FOREIGN = """ConstantMomentum NO_MKDOCS_2_WARNING as cell_size_too_small css csv data_columns
     dev dirty h5 hdf5 import install-completion jaxgran_map js lammpstrj lees_edwards
-    lint-imports lowest mp4 nc ncdump no-caption no-snapshots or False null pandas pure_callback pyplot pyright
-    pytest_cache read_csv select show-completion simulate src tcp tsv txt vjp"""
+    lint-imports lowest mp4 nc ncdump no-caption no-snapshots or False null pandas pure_callback
+    pyplot pyright pytest_cache read_csv select show-completion simulate src tcp tsv txt vjp"""
 PLACEHOLDERS = (
     "ADDRESS COMMAND DT FACTOR FILE FOLDER LIST NAME NUMBER PRESET RULE STRAIN STRESS TAU TOL"
 )
