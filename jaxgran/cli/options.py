@@ -108,7 +108,11 @@ def _declared(name: str, row: Option) -> tuple[Any, Any]:
     option = partial(option, metavar=row.placeholder, autocompletion=lambda: choices)
     if row.kind in (Path, str):
         return row.kind, option()
-    return str, option(parser=partial(parse, name, row))
+
+    def parsed(text: str) -> Any:  # older versions of Typer ask for the name of a parser
+        return parse(name, row, text)
+
+    return str, option(parser=parsed)
 
 
 def parse(name: str, row: Option, text: str) -> Any:
