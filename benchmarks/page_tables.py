@@ -7,6 +7,7 @@ import importlib
 import inspect
 import json
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,7 @@ def variables(group: str) -> str:
     return "\n".join(lines)
 
 
+@cache
 def formulas() -> dict[str, str]:
     """The formulas of the observables as they are written in their table."""
     (table,) = ast.parse(inspect.getsource(Observables)).body
@@ -90,18 +92,15 @@ def options(command: str) -> str:
     rows = ["| option | meaning | default |", "| --- | --- | --- |"]
     for name, one in table_of(command, "OPTIONS").items():
         flag = f"-{one.short}, {option_name(name)}" if one.short else option_name(name)
-        meaning = with_options(one.help, parameters(command)) + (
-            f" In {one.unit}." if one.unit else ""
-        )
+        meaning = with_options(one.help, parameters(command))
+        meaning += f" In {one.unit}." if one.unit else ""
         if isinstance(one.kind, tuple):
-            flag, meaning = (
-                f"{flag} NAME",
-                (f"{meaning} One of {', '.join(f'`{choice}`' for choice in one.kind)}."),
-            )
+            flag += " NAME"
+            meaning += f" One of {', '.join(f'`{choice}`' for choice in one.kind)}."
         elif one.kind is not bool:
             flag = f"{flag} {one.placeholder}".replace("|auto", " or auto")
         elif one.off:
-            flag = f"{flag}, --no-{name}"
+            flag += f", --no-{name}"
         rows.append(f"| `{flag}` | {meaning} | {one.default or '–'} |")
     return "\n".join(rows)
 
