@@ -47,7 +47,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "reference": lambda: reference_figure.draw(shipped_table()),
     "scaling": lambda: scaling.draw(read("scaling"), read("scaling")["exponents"]),
     "speed_vs_accuracy": lambda: chart.draw(read("speed_vs_accuracy")),
-    "stability": lambda: stability.draw(read("stability")["cells"]),
+    "stability": lambda: stability.draw(read("stability")["rows"]),
     "timestep_study": lambda: timestep_study.draw(read("timestep_study")["flows"]),
     "validation": lambda: validation.draw(
         read("validation")["rows"], read("contact_duration")["reference"]

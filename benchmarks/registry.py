@@ -102,7 +102,7 @@ BENCHMARKS = (
         "What are stresses and temperatures at random points that no table of `jg.validity` has "
         "seen?",
         (20, 0.5),
-        ("reference_runs.json",),
+        ("reference_runs.json", "reference_runs_large.json"),
         (Option("--part", "random points, or large flows", choices=("random", "large")),),
     ),
     Benchmark(
@@ -255,8 +255,8 @@ BENCHMARKS = (
     ),
     Benchmark(
         "stability",
-        "What fails first as the time step grows and the packing becomes dense?",
-        (6, 0.5),
+        "Where do methods fail, from loose and elastic to dense and dissipative flows?",
+        (30, 2),
         ("stability.json", "stability.png"),
         one_core=True,
     ),

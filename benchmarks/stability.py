@@ -1,49 +1,68 @@
-"""What fails first as the time step grows and the packing becomes dense, and where nothing fails.
+"""Where methods fail: seven ways to shear the same discs, over ten flows.
 
-For every restitution α and packing fraction ν a flow of 128 grains is brought to its steady state
-at a fine time step. From that state it is sheared by a half (at least 20 steps, at most 3000) at
-each time step, by the default solver and by three that fail earlier. The parameters go beyond what
-the package accepts. Each cell of the figure shows what failed first at α = 0.5; its vertical axis
-is dt √T / σ, the distance that a grain of thermal speed moves in one step.
+The flows go from loose and nearly elastic to dense and dissipative, and to a jammed one. Each
+method has one setting that trades time for accuracy: the time step dt of contact dynamics, the
+stiffness k of soft discs; event-driven discs have none. From the same steady states, three seeds of
+256 discs, every setting is sheared on, and pressure and shear stress are compared with a reference:
+the default at dt = 3e-5 and a tolerance of 1e-6. A cell of the figure is the coarsest setting that
+is right, as all finer ones are: neither stress is off by more than 5 % beyond two standard errors.
+Where none is, its letter says what happened at the finest setting (``OUTCOMES``).
 
-The steps of a cell are done in ten parts, each as long as all before it, and it ends with the first
-part that fails. Only deep overlaps do not end it. In the part that fails the worst failure counts,
-in the order of ``OUTCOMES``. An energy gain is a negative dissipation, or kinetic energy beyond the
-shear work less the dissipation.
+Contact dynamics is stopped by the first block of strain that fails: a solve above the tolerance, no
+impulses, too many contacts, a number that is not finite, or energy that was gained, which is a
+negative dissipation, or kinetic energy beyond the shear work less the dissipation. A setting is
+silent if it is wrong without any of these, and without deep overlaps.
 
-    python -m benchmarks stability            # about 5 minutes on one core
-    python -m benchmarks stability --quick    # about half a minute
+    python -m benchmarks stability            # about half an hour on two cores
+    python -m benchmarks stability --quick    # two flows of 64 grains, about two minutes
 """
 
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Rectangle
 
 import jaxgran as jg
 from benchmarks.output import Output
+from benchmarks.peers import event_driven, lammps
+from benchmarks.peers.jaxgran_itself import discs_of
+from benchmarks.peers.problem import Flow, Run
 from jaxgran.contact.delassus import diagonal
-from jaxgran.dynamics.batch import stack
-from jaxgran.maps.settings import MapSettings
-from jaxgran.model.checks import InputError
+from jaxgran.environment import usable_cores
 from jaxgran.model.status import DEEP_OVERLAP
-from jaxgran.plotting.style import LABEL_SIZE, SMALL_SIZE, TWO_COLUMNS, scientific, styled
+from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, empty_figure, styled
 from jaxgran.sampling.averages import averages
-from jaxgran.sampling.prediction import predicted
+from jaxgran.statistics import jackknife
 
-RESTITUTIONS = (0.0, 0.5, 0.9)
-PACKING_FRACTIONS = (0.3, 0.5, 0.6, 0.7, 0.75, 0.8, 0.82, 0.83, 0.835, 0.84)
-CROSSINGS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3)  # dt √T / σ
-COARSE_GRID = (
-    (0.3, 0.6, 0.75, 0.8, 0.82, 0.83, 0.84),
-    CROSSINGS[3:9],
-)  # of all variants but the default
+JAMMED = 0.84
+FLOWS = (
+    *((0.95, 0.3), (0.9, 0.7), (0.9, 0.8), (0.5, 0.5), (0.5, 0.7)),
+    *((0.5, 0.8), (0.1, 0.5), (0.1, 0.7), (0.1, 0.8), (0.5, JAMMED)),
+)
+TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4)
+STIFFNESSES = (1e3, 1e4, 1e5, 1e6, 1e7)
+RIGHT = 0.05  # relative error of pressure and shear stress
+STRESSES = ("pressure", "shear_stress")
+GAIN = {"float64": 1e-6, "float32": 1e-3}  # of the energies exchanged, which rounding explains
+OUTCOMES = {  # mildest first: letter and meaning
+    "ok": ("", "right"),
+    "too_soft": ("s", "too soft"),
+    "silent": ("!", "wrong, and no status says so"),
+    "iteration_limit": ("t", "solves end above the tolerance"),
+    "deep_overlap": ("o", "deep overlaps"),
+    "infeasible": ("J", "jammed: no impulses exist"),
+    "energy_gain": ("E", "energy gained"),
+    "capacity": ("C", "more contacts than the buffers hold"),
+    "nonfinite": ("N", "not finite"),
+    "collapse": ("c", "inelastic collapse"),
+}
 
 
 @dataclass(frozen=True)
@@ -56,220 +75,210 @@ class JacobiDiagonal(jg.Jacobi):
         return diagonal(contacts, grains)
 
 
-@dataclass(frozen=True)
-class JacobiCount(jg.Jacobi):
-    """``Jacobi`` with D the numbers of contacts of both grains over their masses (mass splitting),
-    which bounds W.
+METHODS: dict[str, dict[str, Any]] = {  # of contact dynamics
+    "single precision": {"dtype": "float32"},
+    "Jacobi, diag W": {"solver": JacobiDiagonal(relaxation=1.0)},
+    "Jacobi, bound of W": {"solver": jg.Jacobi()},
+    "Nesterov": {"solver": jg.Nesterov()},
+    "default": {},
+}
+PEERS = {
+    "event-driven": (event_driven, (0.0,)),
+    "soft discs, LAMMPS": (lammps, STIFFNESSES),
+}
 
-    Source: R. Tonge, F. Benevolenski and A. Voroshilov, ACM Trans. Graph. 31, 105 (2012).
+
+class Plan(NamedTuple):
+    """Flows as (restitution, packing fraction), grains, seeds, blocks of each sample and the strain
+    of each, and the time steps.
     """
 
-    def bound(self, contacts, grains):
-        used = contacts.used.astype(contacts.normals.dtype)
-        count = jnp.zeros(grains, used.dtype).at[contacts.i].add(used).at[contacts.j].add(used)
-        bound = (
-            count[contacts.i] * contacts.inverse_mass_i
-            + count[contacts.j] * contacts.inverse_mass_j
-        )
-        return jnp.where(contacts.used, bound, 1)
+    flows: tuple[tuple[float, float], ...]
+    grains: int
+    seeds: int
+    blocks: int
+    strain: float
+    timesteps: tuple[float, ...]
 
 
-VARIANTS = {
-    "default": {},
-    "Jacobi, ω = 1.8": {"solver": jg.Jacobi(relaxation=1.8)},
-    "Jacobi, ω = 2": {
-        "solver": jax.tree.map(lambda x: 2.0 if x == 1.8 else x, jg.Jacobi())
-    },  # is not accepted
-    "Jacobi with diag W, ω = 1": {"solver": JacobiDiagonal(relaxation=1.0)},
-    "float32": {"dtype": "float32"},
-}
-ALPHA = 0.5  # of the figure
-DRAWN = {  # variants of the figure and their titles
-    "default": "default",
-    "Jacobi, ω = 1.8": r"Jacobi, $\omega=1.8$",
-    "Jacobi, ω = 2": r"Jacobi, $\omega=2$",
-    "Jacobi with diag W, ω = 1": r"Jacobi, diag $W$, $\omega=1$",
-}
-GRAINS = 128
-STRAIN, FEWEST_STEPS, MOST_STEPS, PARTS = 0.5, 20, 3000, 10
-PREPARATION = [(0.05, 1e-3)] * 20 + [(0.2, 1e-3)] * 8 + [(0.1, 3e-4)] * 4  # strain, dt √T / σ
-GAIN = {
-    "float64": 1e-6,
-    "float32": 1e-3,
-}  # of the energies exchanged; what rounding does not explain
-
-# Mildest first: letter, colour, meaning.
-OUTCOMES = {
-    "ok": ("·", "1.0", "nothing fails"),
-    "iteration_limit": ("i", "0.87", "solve above tolerance"),
-    "deep_overlap": ("o", "0.72", r"overlap above $0.01\,\sigma$"),
-    "infeasible": ("J", "0.58", "jammed: no impulses exist"),
-    "energy_gain": ("E", "0.4", "energy gained"),
-    "capacity": ("C", "0.2", "step outruns near pairs"),
-    "nonfinite": ("N", "0.05", "not finite"),
-}
+FULL = Plan(FLOWS, 256, 3, 6, 5.0, TIMESTEPS)
+PARTS = 12  # of the first block of a seed
+QUICK = Plan(((0.8, 0.6), (0.5, JAMMED)), 64, 2, 4, 1.0, (1e-2, 1e-3))
+REFERENCE_TIMESTEP, REFERENCE_TOLERANCE, REFERENCE_BLOCKS = 3e-5, 1e-6, 3  # times the blocks
 
 advance = jax.jit(jg.advance)
 pack = jax.jit(jg.pack)
 
 
-def run(output: Output) -> list[dict]:
-    """Measure all cells, write them with their figures, and return them (see ``cell``)."""
-    restitutions, packing_fractions, crossings, names = (
-        RESTITUTIONS,
-        PACKING_FRACTIONS,
-        CROSSINGS,
-        tuple(VARIANTS),
-    )
-    if output.quick:
-        restitutions, packing_fractions, crossings = (0.5,), (0.6, 0.75, 0.8), (3e-4, 3e-3, 3e-2)
-        names = ("default", "float32")
-    starts = {
-        (alpha, nu): prepared(alpha, nu) for alpha in restitutions for nu in packing_fractions
-    }
-    cells = []
-    for name in names:
-        if name != "default" and not output.quick:
-            packing_fractions, crossings = COARSE_GRID
-        for alpha, nu in ((alpha, nu) for alpha in restitutions for nu in packing_fractions):
-            column = [cell(name, alpha, nu, crossing, *starts[alpha, nu]) for crossing in crossings]
-            whole = [one["pressure"] for one in column if one["strain"] > 0.99 * STRAIN] or [np.nan]
-            ratios = [
-                one["pressure"] / whole[0] if one["strain"] > 0.99 * STRAIN else np.nan
-                for one in column
+def run(output: Output) -> None:
+    """Measure all flows on all cores, print what fails, and write JSON and PNG."""
+    plan, rows = QUICK if output.quick else FULL, []
+    with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
+        dense_first = sorted(plan.flows, key=lambda flow: -flow[1])
+        for future in as_completed(pool.submit(rows_of_flow, plan, one) for one in dense_first):
+            some = future.result()
+            rows += some
+            for row in some:
+                print(
+                    f"α = {row['alpha']:g}, ν = {row['nu']:g}  {row['method']:20s}"
+                    f"{row['setting']:8.0e}  {row['outcome']:16s}"
+                    + "".join(f"{100 * e:8.1f} ± {100 * s:.1f} %" for e, s in row["errors"] or []),
+                    flush=True,
+                )
+    rows.sort(key=lambda row: plan.flows.index((row["alpha"], row["nu"])))
+    head = {**plan._asdict(), "right": RIGHT, "missing": lammps.missing()}
+    output.write_rows("stability", head, "rows", rows)
+    output.write_picture(draw(rows), "stability")
+
+
+def rows_of_flow(plan: Plan, flow: tuple[float, float]) -> list[dict]:
+    """What becomes of a flow by every method and setting.
+
+    ===================  ====  ==================================================================
+    key                  unit  meaning
+    ===================  ====  ==================================================================
+    alpha, nu            –     where
+    method, setting      –     a key of ``METHODS`` or ``PEERS``; its dt in 1/γ̇ or k in mγ̇²
+    outcome, detail      –     a key of ``OUTCOMES``, and the words of a peer that failed
+    strain               –     that was sampled, over all seeds
+    errors               –     relative errors of pressure and shear stress with standard errors,
+                               None where nothing was sampled or nothing is right
+    largest_overlap      σ     of a contact, by contact dynamics
+    ===================  ====  ==================================================================
+    """
+    alpha, nu = flow
+    states = [start(plan.grains, alpha, nu, seed) for seed in range(plan.seeds)]
+    solver = jg.BarzilaiBorwein(tolerance=REFERENCE_TOLERANCE)
+    longer = plan._replace(blocks=REFERENCE_BLOCKS * plan.blocks)
+    reference = None
+    if nu != JAMMED:
+        reference = means(sheared(longer, flow, states, REFERENCE_TIMESTEP, solver)[0])
+    rows = []
+    for method, (peer, settings) in PEERS.items():
+        if not peer.missing():
+            rows += [
+                {"method": method, "setting": setting, **by_peer(peer, plan, flow, states, setting)}
+                for setting in settings
             ]
-            cells += [
-                {**one, "pressure_ratio": ratio} for one, ratio in zip(column, ratios, strict=True)
-            ]
-            print(
-                f"{name:26s} α = {alpha:3g}  ν = {nu:5g}  "
-                f"{' '.join(OUTCOMES[c['outcome']][0] for c in column)}"
+    for method, chosen in METHODS.items():
+        for dt in plan.timesteps:
+            found, outcome, overlap = sheared(plan, flow, states, dt, **chosen)
+            rows.append(
+                {"method": method, "setting": dt, "found": found, "outcome": outcome}
+                | {"largest_overlap": overlap}
             )
-    head = {"grains": GRAINS, "strain": STRAIN, "steps": [FEWEST_STEPS, MOST_STEPS]}
-    output.write_rows("stability", head, "cells", cells)
-    output.write_picture(draw(cells), "stability", dpi=200)
-    return cells
+    return [{"alpha": alpha, "nu": nu} | judged(row, reference, plan.strain) for row in rows]
 
 
-def unjudged(flow: jg.ShearFlow, **numbers: float) -> jg.ShearFlow:
-    """The flow with other numbers that are not judged: leaves of a pytree never are."""
-    return jax.tree_util.tree_map_with_path(
-        lambda path, value: numbers.get(path[-1].name, value), flow
+def judged(row: dict, reference: dict | None, strain: float) -> dict:
+    """A row with errors in place of the stresses of its blocks, and with its outcome.
+
+    A setting that ran to its end and is right is "ok", whatever its overlaps are. One that is wrong
+    has the outcome of its run; if that is "ok", it is silent. Nothing is right in a jammed packing.
+    """
+    found, outcome = row.pop("found"), row["outcome"]
+    errors = None
+    if len(found) > 1 and reference is not None:
+        errors = [
+            [value / right - 1, float(np.hypot(error, unsure)) / right]
+            for (value, error), (right, unsure) in zip(means(found), reference, strict=True)
+        ]
+    right = errors is not None and all(abs(error) - 2 * noise <= RIGHT for error, noise in errors)
+    if outcome in ("ok", "deep_overlap", "too_soft"):
+        row |= {"flagged": outcome == "deep_overlap"}
+        outcome = "ok" if right else {"ok": "silent"}.get(outcome, outcome)
+    return row | {"outcome": outcome, "errors": errors, "strain": len(found) * strain}
+
+
+def means(found: np.ndarray) -> list[tuple[float, float]]:
+    """Means of pressure and shear stress over blocks (blocks, 2), and their standard errors."""
+    value, error = jackknife(
+        lambda sums: {"mean": sums["found"] / sums["count"][..., None]},
+        {"found": np.asarray(found)[None], "count": np.ones((1, len(found)))},
     )
+    return list(zip(value["mean"].tolist(), error["mean"].tolist(), strict=True))
 
 
-def flow_of(variant: str, alpha: float, nu: float, **numbers: float) -> jg.ShearFlow:
-    """A flow whose numbers are not judged, in the precision of a variant."""
-    activation, dtype = (
-        VARIANTS[variant].get(name, x)
-        for name, x in (("activation", "midpoint"), ("dtype", "float64"))
+# ----------------------------------------------------------------------------------------------
+# contact dynamics
+
+
+def flow_of(grains: int, alpha: float, nu: float, dt: float, dtype: str = "float64"):
+    """A flow whose packing fraction is not judged, in a precision."""
+    flow = jg.ShearFlow(grains, alpha, 0.5, dt)
+    flow = jax.tree_util.tree_map_with_path(
+        lambda path, value: nu if path[-1].name == "packing_fraction" else value, flow
     )
-    flow = jg.ShearFlow(GRAINS, 0.5, 0.5, 1e-3, activation=activation)
-    flow = unjudged(flow, restitution=alpha, packing_fraction=nu, **numbers)
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), flow)
 
 
-def solver_of(variant: str) -> jg.ProjectedMethod:
-    """The solver of a variant, in its precision."""
-    dtype = VARIANTS[variant].get("dtype", "float64")
-    solver = VARIANTS[variant].get("solver", jg.BarzilaiBorwein())
-    return jax.tree.map(lambda x: jnp.asarray(x, "int32" if isinstance(x, int) else dtype), solver)
-
-
-def prepared(alpha: float, nu: float) -> tuple[jg.State, float]:
-    """A sheared state, the same for all variants, and its temperature in mσ²γ̇², an average over
-    the last strain.
-
-    The temperature of theory is a poor start where the flow is dense, so the time step follows the
-    temperature.
+def start(grains: int, alpha: float, nu: float, seed: int) -> jg.State:
+    """A steady state, or a packing at the jammed density whose grains have a thermal speed of
+    10 σγ̇.
     """
-    for seed in range(10):
-        state, found = pack(flow_of("default", alpha, nu), jax.random.key(seed))
+    if nu != JAMMED:
+        return jg.prepare(jg.ShearFlow(grains, alpha, nu, 3e-4), jax.random.key(seed))
+    for attempt in range(10):
+        state, found = pack(flow_of(grains, alpha, nu, 1e-3), jax.random.key(10 * seed + attempt))
         if found:
             break
     masses = np.asarray(state.grains.masses)[:, None]
-    velocities = np.random.default_rng(0).normal(size=state.velocities.shape) / np.sqrt(masses)
+    velocities = np.random.default_rng(seed).normal(size=state.velocities.shape) / np.sqrt(masses)
     velocities -= np.sum(masses * velocities, axis=0) / np.sum(masses)
-    theory = jax.tree.map(lambda x: x[0], predicted(stack([flow_of("default", alpha, nu)])))
-    state = replace(
-        state, velocities=jnp.asarray(velocities * np.sqrt(float(theory.granular_temperature)))
+    return replace(state, velocities=jnp.asarray(10 * velocities))
+
+
+def sheared(
+    plan: Plan,
+    flow: tuple[float, float],
+    states: list[jg.State],
+    dt: float,
+    solver: jg.ProjectedMethod | None = None,
+    dtype: str = "float64",
+) -> tuple[np.ndarray, str, float]:
+    """Pressure and shear stress of the blocks (blocks, 2) of all seeds, what went wrong, and the
+    largest overlap; the first block of a seed is left out.
+    """
+    one = flow_of(plan.grains, *flow, dt, dtype)
+    solver = solver or jg.BarzilaiBorwein()
+    solver = jax.tree.map(
+        lambda x: jnp.asarray(x, "int32" if isinstance(x, int) else dtype), solver
     )
-    temperatures = []
-    for strain, crossing in PREPARATION:
-        dt = crossing / np.sqrt(energy(state) / GRAINS)
-        flow = flow_of("default", alpha, nu, timestep=dt)
-        state, tally = advance(
-            flow, state, jnp.int32(round(strain / dt)), solver=jg.BarzilaiBorwein(max_steps=500)
-        )
-        temperatures.append(
-            float(averages(tally, state.side**2, GRAINS, flow.shear_rate)["granular_temperature"])
-        )
-    return state, float(np.mean(temperatures[-8:]))
+    total = round(plan.strain / dt)
+    found: list[list[float]] = []
+    worst, deepest = "ok", 0.0
+    for first in states:
+        state = jax.tree.map(lambda x: x.astype(dtype), first)
+        for block in range(plan.blocks + 1):
+            before = energy(state)
+            for piece in pieces(total) if block == 0 else [total]:
+                state, tally = advance(one, state, jnp.int32(piece), solver=solver)
+                status = jg.Status(int(tally.status))
+                if status not in (jg.Status.ok, jg.Status.deep_overlap):
+                    return np.array(found), status.name, float(tally.largest_overlap)
+            deepest = max(deepest, float(tally.largest_overlap))
+            if block and gains(
+                tally, energy(state) - before, GAIN[dtype] * (before + energy(state))
+            ):
+                return np.array(found), "energy_gain", deepest
+            if status == jg.Status.deep_overlap or tally.largest_overlap > DEEP_OVERLAP:
+                worst = "deep_overlap"
+            if block:
+                mean = averages(tally, state.side**2, plan.grains, one.shear_rate)
+                found.append([float(mean[name]) for name in STRESSES])
+    return np.array(found), worst, deepest
+
+
+def pieces(steps: int) -> list[int]:
+    """Parts of some steps, each as long as all before it, so that what fails ends early."""
+    edges = np.unique([0, *np.ceil(steps / 2.0 ** np.arange(PARTS)).astype(int)])
+    return np.diff(edges).tolist()
 
 
 def energy(state: jg.State) -> float:
-    """Kinetic energy of the peculiar velocities, mσ²γ̇²; N of them are the temperature."""
+    """Kinetic energy of the peculiar velocities, mσ²γ̇²."""
     velocities = np.asarray(state.velocities, float)
     return float(np.sum(np.asarray(state.grains.masses, float)[:, None] * velocities**2) / 2)
-
-
-def cell(
-    variant: str, alpha: float, nu: float, crossing: float, state: jg.State, temperature: float
-) -> dict:
-    """What failed first at one time step, and averages over the steps until then.
-
-    ============================  ==============  ==================================================
-    key                           unit            meaning
-    ============================  ==============  ==================================================
-    variant, alpha, nu            –               where
-    crossing, dt, temperature     σ, 1/γ̇, mσ²γ̇²   dt √T, time step, T of the state it started from
-    accepted                      –               whether a map accepts this flow
-    outcome, failed_after         –               a key of ``OUTCOMES``, the strain to the end of
-                                                  the failing part
-    strain                        –               that was sheared
-    largest_overlap               σ               of a contact
-    unconverged, iterations       –               share of the solves above the tolerance, mean
-                                                  iterations
-    pressure                      mγ̇²             contact and kinetic
-    ============================  ==============  ==================================================
-    """
-    dt = crossing / np.sqrt(temperature)
-    flow = flow_of(variant, alpha, nu, timestep=dt)
-    precision = flow.timestep.dtype
-    state = jax.tree.map(lambda x: x.astype(precision), state)
-    total = int(np.clip(np.ceil(STRAIN / dt), FEWEST_STEPS, MOST_STEPS))
-    edges = np.unique(np.ceil(total / 2.0 ** np.arange(PARTS)).astype(int))
-    outcome, failed_after, whole = "ok", np.nan, None
-    for steps, end in zip(np.diff(edges, prepend=0), edges, strict=True):
-        before = energy(state)
-        state, tally = advance(flow, state, jnp.int32(steps), solver=solver_of(variant))
-        whole = tally if whole is None else whole + tally
-        now = jg.Status(int(tally.status)).name
-        if tally.status <= jg.Status.deep_overlap and tally.largest_overlap > DEEP_OVERLAP:
-            now = "deep_overlap"
-        if gains(tally, energy(state) - before, GAIN[precision.name] * (before + energy(state))):
-            now = max(now, "energy_gain", key=list(OUTCOMES).index)
-        if outcome == "ok" and now != "ok":
-            outcome, failed_after = now, float(end * dt)
-        if now not in ("ok", "deep_overlap"):
-            break
-    measured = averages(whole, state.side**2, GRAINS, flow.shear_rate)
-    return {
-        "variant": variant,
-        "alpha": alpha,
-        "nu": nu,
-        "crossing": crossing,
-        "dt": float(dt),
-        "temperature": temperature,
-        "accepted": accepts(alpha, nu, dt),
-        "outcome": outcome,
-        "failed_after": failed_after,
-        "strain": float(whole.duration),
-        "largest_overlap": float(whole.largest_overlap),
-        "unconverged": float(measured["unconverged_share"]),
-        "iterations": float(measured["iterations"]),
-        "pressure": float(measured["pressure"]),
-    }
 
 
 def gains(tally: jg.Tally, rise: float, rounding: float) -> bool:
@@ -282,77 +291,87 @@ def gains(tally: jg.Tally, rise: float, rounding: float) -> bool:
     return dissipation < -rounding or rise > work - dissipation + rounding
 
 
-def accepts(alpha: float, nu: float, dt: float) -> bool:
-    """Whether a map would run this flow."""
-    try:
-        MapSettings((alpha,), (nu,), grains=GRAINS, timestep=dt, strain=1e4)
-    except InputError:
-        return False
-    return True
+# ----------------------------------------------------------------------------------------------
+# other programs
+
+
+def by_peer(
+    peer: Any, plan: Plan, flow: tuple[float, float], states: list[jg.State], setting: float
+) -> dict:
+    """Stresses of the blocks of all seeds by another program, and how it failed."""
+    failed = "collapse" if peer is event_driven else "too_soft"
+    (curve,), found = peer.CURVES, []
+    for state in states:
+        try:
+            one: Run = peer.begin(discs_of(state), Flow(*flow), curve, setting, plan.strain)
+            found += [one.advance()[: len(STRESSES)] for _ in range(plan.blocks + 1)][1:]
+            one.close()
+        except Exception as failure:  # of a program that is not ours to mend
+            return {"found": np.array(found), "outcome": failed, "detail": str(failure)}
+    fine = "ok" if peer is event_driven else "too_soft"
+    return {"found": np.array(found), "outcome": fine}
+
+
+# ----------------------------------------------------------------------------------------------
+# figure
+
+
+def cells(rows: list[dict]) -> Iterator[tuple[float, float, str, float | None, str]]:
+    """α, ν and method of each cell, the coarsest setting from which on all are right, and the
+    outcome of the finest one.
+    """
+    keys = dict.fromkeys((row["alpha"], row["nu"], row["method"]) for row in rows)
+    for key in keys:
+        column = [row for row in rows if (row["alpha"], row["nu"], row["method"]) == key]
+        wrong = [k for k, row in enumerate(column) if row["outcome"] != "ok"]
+        right = column[max(wrong, default=-1) + 1 :]
+        yield *key, right[0]["setting"] if right else None, column[-1]["outcome"]
 
 
 @styled
-def draw(cells: list[dict]) -> Figure:
-    """What failed first at α = 0.5, a panel for each solver; the cells of a map lie below the thick
-    line.
-    """
-    figure = Figure(figsize=(TWO_COLUMNS, 3.1), layout="constrained")
-    panels = figure.subplots(1, len(DRAWN), sharex=True, sharey=True)
-    coarse = [one for one in cells if one["variant"] == list(DRAWN)[-1]]
-    nus, crossings = (sorted({one[name] for one in coarse}) for name in ("nu", "crossing"))
-    drawn = [one for one in cells if one["alpha"] == ALPHA and one["variant"] in DRAWN]
-    drawn = [one for one in drawn if one["nu"] in nus and one["crossing"] in crossings]
-    for axes, (name, title) in zip(panels, DRAWN.items(), strict=True):
-        panel(axes, [one for one in drawn if one["variant"] == name], nus, crossings)
-        axes.set_title(title)
-    panels[0].set_ylabel(r"step of a thermal grain $\Delta t\sqrt{T/m}\,/\sigma$")
-    figure.supxlabel(r"packing fraction $\nu$", fontsize=LABEL_SIZE)
-    failed = [outcome for outcome in OUTCOMES if outcome in {one["outcome"] for one in drawn}]
-    handles: list[Artist] = [
-        Patch(
-            facecolor=OUTCOMES[name][1],
-            edgecolor="0.5",
-            label=f"{OUTCOMES[name][0]}  {OUTCOMES[name][2]}",
-        )
-        for name in failed
-    ]
-    handles.append(Line2D([], [], color="black", lw=2, label="limit of a map"))
-    figure.legend(handles=handles, loc="outside upper center", ncols=4)
+def draw(rows: list[dict]) -> Figure:
+    """A table: methods by flows, the coarsest setting that is right, or what fails."""
+    methods = [name for name in (*PEERS, *METHODS) if name in {row["method"] for row in rows}]
+    flows = list(dict.fromkeys((row["alpha"], row["nu"]) for row in rows))
+    figure = empty_figure(TWO_COLUMNS, 2.5)
+    axes = figure.add_subplot()
+    letters = set()
+    for alpha, nu, method, setting, outcome in cells(rows):
+        x, y = flows.index((alpha, nu)), methods.index(method)
+        if setting is None:
+            text, colour = OUTCOMES[outcome][0], "#f4a582"
+            letters.add(outcome)
+        else:
+            text, colour = text_of(method, setting), shade_of(method, setting)
+        axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
+        weight = "bold" if setting is None else "normal"
+        axes.text(x, y, text, ha="center", va="center", fontsize=SMALL_SIZE, weight=weight)
+    axes.set(xlim=(-0.5, len(flows) - 0.5), ylim=(len(methods) - 0.5, -0.5))
+    names = [f"{alpha:g}\n{nu:g}" for alpha, nu in flows]
+    axes.set_xticks(range(len(flows)), names)
+    axes.set_yticks(range(len(methods)), methods)
+    axes.tick_params(length=0, labeltop=True, labelbottom=False)
+    axes.text(-0.6, -1.05, r"$\alpha$" + "\n" + r"$\nu$", ha="right", va="center")
+    axes.spines[:].set_visible(False)
+    key = "   ".join(
+        f"{OUTCOMES[name][0]}  {OUTCOMES[name][1]}" for name in OUTCOMES if name in letters
+    )
+    axes.set_xlabel(key, fontsize=SMALL_SIZE)
     return figure
 
 
-def panel(axes: Axes, cells: list[dict], nus: list[float], crossings: list[float]) -> None:
-    """One field of lettered cells; both axes list their values and are not to scale."""
-    for one in cells:
-        x, y = nus.index(one["nu"]), crossings.index(one["crossing"])
-        letter, shade, _ = OUTCOMES[one["outcome"]]
-        axes.add_patch(
-            Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=shade, edgecolor="white", lw=0.5)
-        )
-        ink = "white" if float(shade) < 0.5 else "black"
-        axes.text(
-            x, y, letter, ha="center", va="center", color=ink, weight="bold", fontsize=SMALL_SIZE
-        )
-    if {one["variant"] for one in cells} == {"default"}:
-        accepted = [
-            max(
-                [
-                    crossings.index(c["crossing"]) + 1
-                    for c in cells
-                    if c["nu"] == nu and c["accepted"]
-                ]
-                or [0]
-            )
-            for nu in nus
-        ]
-        axes.stairs(
-            np.array(accepted) - 0.5,
-            np.arange(len(nus) + 1) - 0.5,
-            baseline=-0.5,
-            color="black",
-            lw=2,
-        )
-    axes.set(xlim=(-0.5, len(nus) - 0.5), ylim=(-0.5, len(crossings) - 0.5))
-    axes.set_xticks(range(len(nus)), [f"{nu:g}" for nu in nus], rotation=90)
-    axes.set_yticks(range(len(crossings)), [f"${scientific(crossing)}$" for crossing in crossings])
-    axes.tick_params(length=0)
+def text_of(method: str, setting: float) -> str:
+    """A setting as it stands in its cell."""
+    if setting == 0:
+        return "right"
+    mantissa, exponent = f"{setting:.0e}".split("e")
+    power = rf"10^{{{int(exponent)}}}"
+    return f"${power}$" if mantissa == "1" else rf"${mantissa}\times{power}$"
+
+
+def shade_of(method: str, setting: float) -> str:
+    """Dark where a coarse setting suffices."""
+    if setting == 0:
+        return "0.75"
+    settings = STIFFNESSES if method == "soft discs, LAMMPS" else TIMESTEPS
+    return str(0.72 + 0.05 * min(settings.index(setting), 4)) if setting in settings else "0.9"

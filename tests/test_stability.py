@@ -2,44 +2,48 @@
 refused.
 """
 
-from functools import cache
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxgran as jg
 from benchmarks import stability
-from jaxgran.model.state import State
 from jaxgran.model.status import DEEP_OVERLAP, Status
 
-pack = jax.jit(stability.pack)
 
-
-@pytest.mark.parametrize("packing_fraction", [0.82, 0.835])
+@pytest.mark.parametrize("packing_fraction", [0.82, stability.JAMMED])
 def test_dense_flow_converges_or_is_flagged(packing_fraction: float) -> None:
-    """Beside jamming at 0.8386: what is called ok is solved, hardly overlaps and is finite, and no
-    energy appears.
+    """Below jamming at 0.8386 it is ok. Above, what is called ok is solved, hardly overlaps and is
+    finite, and no energy appears.
     """
-    state, _ = warm(0.0, packing_fraction)
-    flow = stability.flow_of("default", 0.0, packing_fraction, timestep=3e-4)
+    grains, solver = 64, jg.BarzilaiBorwein()
+    state = stability.start(grains, 0.0, packing_fraction, seed=0)
+    flow = stability.flow_of(grains, 0.0, packing_fraction, 3e-4)
     before = stability.energy(state)
-    state, tally = stability.advance(flow, state, jnp.int32(300))
+    state, tally = stability.advance(flow, state, jnp.int32(300), solver=solver)
     finite = all(np.isfinite(x).all() for x in jax.tree.leaves((state, tally)))
     status = Status(int(tally.status))
     assert finite or status == Status.nonfinite
     if status == Status.ok:
         assert (tally.deep_contacts > 0) == (tally.largest_overlap > DEEP_OVERLAP)
-        assert tally.worst_residual <= 1.01 * stability.solver_of("default").tolerance
+        assert tally.worst_residual <= 1.01 * solver.tolerance
     else:
         assert tally.unconverged > 0 or not finite
+    assert status == Status.ok or packing_fraction >= stability.JAMMED
     assert not stability.gains(tally, stability.energy(state) - before, 1e-6 * before)
 
 
-@cache
-def warm(restitution: float, packing_fraction: float) -> tuple[State, float]:
-    """``stability.prepared`` of less strain, shared by the tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stability, "pack", pack)
-        patch.setattr(stability, "PREPARATION", [(0.05, 1e-3)] * 8)
-        return stability.prepared(restitution, packing_fraction)
+def test_a_setting_is_silent_only_if_nothing_tells_that_it_is_wrong() -> None:
+    reference = [(10.0, 0.1), (5.0, 0.05)]
+    right = np.array([[10.0, 5.0], [10.1, 5.05], [9.9, 4.95]])
+    for found, outcome, judged in (
+        (right, "ok", "ok"),
+        (right, "deep_overlap", "ok"),
+        (1.2 * right, "ok", "silent"),
+        (1.2 * right, "deep_overlap", "deep_overlap"),
+        (right * [1, 0.8], "ok", "silent"),
+        (right[:0], "iteration_limit", "iteration_limit"),
+    ):
+        row = stability.judged({"found": found, "outcome": outcome}, reference, 1.0)
+        assert row["outcome"] == judged

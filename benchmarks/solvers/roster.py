@@ -1,12 +1,16 @@
 """All solvers that are compared, by name."""
 
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
+import jax.numpy as jnp
+
+import jaxgran as jg
 from benchmarks.collection.compare import Prepare, projected, swept
 from benchmarks.solvers.numba_engine import by_cluster
-from benchmarks.stability import JacobiCount, JacobiDiagonal
+from benchmarks.stability import JacobiDiagonal
 from jaxgran.contact.projected_methods import SOLVERS
 
 DEFAULT = "barzilai-borwein"
@@ -23,6 +27,24 @@ class Solver(NamedTuple):
     counts: str
     settings: dict
     ours: bool = False
+
+
+@dataclass(frozen=True)
+class JacobiCount(jg.Jacobi):
+    """``Jacobi`` with D the numbers of contacts of both grains over their masses (mass splitting),
+    which bounds W.
+
+    Source: R. Tonge, F. Benevolenski and A. Voroshilov, ACM Trans. Graph. 31, 105 (2012).
+    """
+
+    def bound(self, contacts, grains):
+        used = contacts.used.astype(contacts.normals.dtype)
+        count = jnp.zeros(grains, used.dtype).at[contacts.i].add(used).at[contacts.j].add(used)
+        bound = (
+            count[contacts.i] * contacts.inverse_mass_i
+            + count[contacts.j] * contacts.inverse_mass_j
+        )
+        return jnp.where(contacts.used, bound, 1)
 
 
 def our_solvers() -> dict[str, Solver]:
