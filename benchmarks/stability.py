@@ -5,7 +5,8 @@ method has one setting that trades time for accuracy: the time step dt of contac
 stiffness k of soft discs; event-driven discs have none. From the same steady states, three seeds of
 256 discs, every setting is sheared on, and pressure and shear stress are compared with a reference:
 the default at dt = 3e-5 and a tolerance of 1e-6. A cell of the figure is the coarsest setting that
-is right, as all finer ones are: both stresses within 5 %, of which one to two are noise. Where none is, its letter says what happened at the finest setting (``OUTCOMES``).
+is right, as all finer ones are: both stresses within 5 %, of which one to two are noise. Where none
+is, its letter says what happened at the finest setting (``OUTCOMES``).
 
 Contact dynamics is stopped by the first block of strain that fails: a solve above the tolerance, no
 impulses, too many contacts, a number that is not finite, or energy that was gained, which is a

@@ -52,4 +52,4 @@ def test_a_setting_is_silent_only_if_nothing_tells_that_it_is_wrong() -> None:
 def test_parts_of_a_block_make_it_up() -> None:
     for steps in (1, 2, 100, 5000):
         assert sum(stability.pieces(steps)) == steps
-        assert stability.pieces(steps)[0] <= max(1, steps // 2000)
+        assert stability.pieces(steps)[0] <= max(1, steps // 1000)
