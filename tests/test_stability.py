@@ -35,15 +35,21 @@ def test_dense_flow_converges_or_is_flagged(packing_fraction: float) -> None:
 
 
 def test_a_setting_is_silent_only_if_nothing_tells_that_it_is_wrong() -> None:
-    reference = [(10.0, 0.1), (5.0, 0.05)]
-    right = np.array([[10.0, 5.0], [10.1, 5.05], [9.9, 4.95]])
-    for found, outcome, judged in (
-        (right, "ok", "ok"),
-        (right, "deep_overlap", "ok"),
-        (1.2 * right, "ok", "silent"),
-        (1.2 * right, "deep_overlap", "deep_overlap"),
-        (right * [1, 0.8], "ok", "silent"),
-        (right[:0], "iteration_limit", "iteration_limit"),
+    for errors, outcome, judged in (
+        ([[0.01, 0.01], [-0.04, 0.01]], "ok", "ok"),
+        ([[0.01, 0.01], [-0.04, 0.01]], "deep_overlap", "ok"),
+        ([[0.01, 0.01], [-0.06, 0.01]], "ok", "silent"),
+        ([[0.2, 0.01], [0.0, 0.01]], "deep_overlap", "deep_overlap"),
+        ([[0.0, 0.01], [0.0, 0.01]], "iteration_limit", "iteration_limit"),
+        (None, "ok", "silent"),
     ):
-        row = stability.judged({"found": found, "outcome": outcome}, reference, 1.0)
-        assert row["outcome"] == judged
+        row = {"method": "default", "outcome": outcome, "errors": errors}
+        assert stability.verdict(row) == judged
+    soft = {"method": "soft discs, LAMMPS", "outcome": "ok", "errors": [[0.1, 0.0]]}
+    assert stability.verdict(soft) == "too_soft"
+
+
+def test_parts_of_a_block_make_it_up() -> None:
+    for steps in (1, 2, 100, 5000):
+        assert sum(stability.pieces(steps)) == steps
+        assert stability.pieces(steps)[0] <= max(1, steps // 1000)
