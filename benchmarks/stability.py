@@ -4,23 +4,27 @@ The flows go from loose and nearly elastic to dense and dissipative, and to a ja
 method has one setting that trades time for accuracy: the time step dt of contact dynamics, the
 stiffness k of soft discs; event-driven discs have none. From the same steady states, three seeds of
 256 discs, every setting is sheared on, and pressure and shear stress are compared with a reference:
-the default at dt = 3e-5 and a tolerance of 1e-6. A cell of the figure is the coarsest setting that
-is right, as all finer ones are: both stresses within 5 %, of which one to two are noise. Where none
-is, its letter says what happened at the finest setting (``OUTCOMES``).
+the default at dt = 1e-4 and a tolerance of 1e-6. A cell of the figure is the coarsest setting that
+is right: both stresses within 5 %, of which one to two are noise, there and at the next finer
+setting, with which the search ends. Where none is, its letter says what happened at the finest
+setting (``OUTCOMES``).
 
 Contact dynamics is stopped by the first block of strain that fails: a solve above the tolerance, no
 impulses, too many contacts, a number that is not finite, or energy that was gained, which is a
-negative dissipation, or kinetic energy beyond the shear work less the dissipation. A setting is
-silent if it is wrong without any of these, and without deep overlaps.
+negative dissipation, or kinetic energy beyond the shear work less the dissipation. It is stopped,
+too, where it takes more than ``SLOW``. A setting is silent if it is wrong without any of these, and
+without deep overlaps.
 
-    python -m benchmarks stability            # about half an hour on two cores
+    python -m benchmarks stability            # about an hour on two cores
     python -m benchmarks stability --quick    # two flows of 64 grains, about two minutes
 """
 
 import multiprocessing
+import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -50,9 +54,13 @@ TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4)
 STIFFNESSES = (1e3, 1e4, 1e5, 1e6, 1e7)
 RIGHT = 0.05  # relative error of pressure and shear stress
 STRESSES = ("pressure", "shear_stress")
+SLOW = (
+    5e-3  # s of processor time for a grain and a unit of strain; the default takes 0.15 ms at most
+)
 GAIN = {"float64": 1e-6, "float32": 1e-3}  # of the energies exchanged, which rounding explains
 OUTCOMES = {  # mildest first: letter and meaning
     "ok": ("", "right"),
+    "too_slow": ("$", "too slow"),
     "too_soft": ("s", "too soft"),
     "silent": ("!", "wrong, and no status says so"),
     "iteration_limit": ("t", "solves end above the tolerance"),
@@ -104,7 +112,7 @@ class Plan(NamedTuple):
 FULL = Plan(FLOWS, 256, 3, 6, 5.0, TIMESTEPS)
 PARTS = 12  # of the first block of a seed
 QUICK = Plan(((0.8, 0.6), (0.5, JAMMED)), 64, 2, 4, 1.0, (1e-2, 1e-3))
-REFERENCE_TIMESTEP, REFERENCE_TOLERANCE, REFERENCE_BLOCKS = 3e-5, 1e-6, 3  # times the blocks
+REFERENCE_TIMESTEP, REFERENCE_TOLERANCE, REFERENCE_BLOCKS = 1e-4, 1e-6, 3  # times the blocks
 
 advance = jax.jit(jg.advance)
 pack = jax.jit(jg.pack)
@@ -116,15 +124,7 @@ def run(output: Output) -> None:
     with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
         dense_first = sorted(plan.flows, key=lambda flow: -flow[1])
         for future in as_completed(pool.submit(rows_of_flow, plan, one) for one in dense_first):
-            some = future.result()
-            rows += some
-            for row in some:
-                print(
-                    f"α = {row['alpha']:g}, ν = {row['nu']:g}  {row['method']:20s}"
-                    f"{row['setting']:8.0e}  {verdict(row):16s}"
-                    + "".join(f"{100 * e:8.1f} ± {100 * s:.1f} %" for e, s in row["errors"] or []),
-                    flush=True,
-                )
+            rows += future.result()
     rows.sort(key=lambda row: plan.flows.index((row["alpha"], row["nu"])))
     head = {**plan._asdict(), "right": RIGHT, "missing": lammps.missing()}
     output.write_rows("stability", head, "rows", rows)
@@ -152,27 +152,33 @@ def rows_of_flow(plan: Plan, flow: tuple[float, float]) -> list[dict]:
     longer = plan._replace(blocks=REFERENCE_BLOCKS * plan.blocks)
     reference = None
     if nu != JAMMED:
-        reference = means(sheared(longer, flow, states, REFERENCE_TIMESTEP, solver)[0])
+        found, _ = sheared(longer, flow, states, REFERENCE_TIMESTEP, solver, limit=np.inf)
+        reference = means(found)
+    ways = {
+        method: (settings, partial(by_peer, peer, plan, flow, states))
+        for method, (peer, settings) in PEERS.items()
+        if not peer.missing()
+    } | {
+        method: (plan.timesteps, partial(sheared, plan, flow, states, **chosen))
+        for method, chosen in METHODS.items()
+    }
     rows = []
-    for method, (peer, settings) in PEERS.items():
-        if not peer.missing():
-            rows += [
-                {"method": method, "setting": setting, **by_peer(peer, plan, flow, states, setting)}
-                for setting in settings
-            ]
-    for method, chosen in METHODS.items():
-        for dt in plan.timesteps:
-            found, outcome, overlap = sheared(plan, flow, states, dt, **chosen)
-            rows.append(
-                {"method": method, "setting": dt, "found": found, "outcome": outcome}
-                | {"largest_overlap": overlap}
+    for method, (settings, way) in ways.items():
+        verdicts = []
+        for setting in settings:
+            found, how = way(setting)
+            row = {"alpha": alpha, "nu": nu, "method": method, "setting": setting, **how}
+            row |= {"strain": len(found) * plan.strain, "errors": relative_errors(found, reference)}
+            rows.append(row)
+            verdicts.append(verdict(row))
+            print(
+                f"α = {alpha:g}, ν = {nu:g}  {method:20s}{setting:8.0e}  {verdicts[-1]:16s}"
+                + "".join(f"{100 * e:8.1f} ± {100 * s:.1f} %" for e, s in row["errors"] or []),
+                flush=True,
             )
-    return [
-        {"alpha": alpha, "nu": nu, **row, "strain": len(found) * plan.strain}
-        | {"errors": relative_errors(found, reference)}
-        for row in rows
-        for found in [row.pop("found")]
-    ]
+            if verdicts[-2:] == ["ok", "ok"]:
+                break
+    return rows
 
 
 def relative_errors(
@@ -200,7 +206,7 @@ def verdict(row: dict) -> str:
     errors = row["errors"]
     if errors is not None and max(abs(error) for error, _ in errors) <= RIGHT:
         return "ok"
-    if row["method"] in PEERS:
+    if "LAMMPS" in row["method"]:
         return "too_soft"
     return {"ok": "silent"}.get(row["outcome"], row["outcome"])
 
@@ -250,9 +256,10 @@ def sheared(
     dt: float,
     solver: jg.ProjectedMethod | None = None,
     dtype: str = "float64",
-) -> tuple[np.ndarray, str, float]:
+    limit: float = SLOW,
+) -> tuple[np.ndarray, dict]:
     """Pressure and shear stress of the blocks (blocks, 2) of all seeds, what went wrong, and the
-    largest overlap; the first block of a seed is left out.
+    largest overlap; the first block of a seed is left out, and its first part of the time.
     """
     one = flow_of(plan.grains, *flow, dt, dtype)
     solver = solver or jg.BarzilaiBorwein()
@@ -262,26 +269,37 @@ def sheared(
     total = round(plan.strain / dt)
     found: list[list[float]] = []
     worst, deepest = "ok", 0.0
+
+    def ended(outcome: str) -> tuple[np.ndarray, dict]:
+        return np.array(found), {"outcome": outcome, "largest_overlap": deepest}
+
     for first in states:
         state = jax.tree.map(lambda x: x.astype(dtype), first)
+        steps, begin = 0, 0.0
         for block in range(plan.blocks + 1):
             before = energy(state)
             for piece in pieces(total) if block == 0 else [total]:
                 state, tally = advance(one, state, jnp.int32(piece), solver=solver)
                 status = jg.Status(int(tally.status))
+                deepest = max(deepest, float(tally.largest_overlap))
                 if status not in (jg.Status.ok, jg.Status.deep_overlap):
-                    return np.array(found), status.name, float(tally.largest_overlap)
-            deepest = max(deepest, float(tally.largest_overlap))
+                    return ended(status.name)
+                if begin:
+                    steps += piece
+                    seconds = time.process_time() - begin
+                    if seconds > 1 and seconds > limit * plan.grains * dt * steps:
+                        return ended("too_slow")
+                begin = begin or time.process_time()
             if block and gains(
                 tally, energy(state) - before, GAIN[dtype] * (before + energy(state))
             ):
-                return np.array(found), "energy_gain", deepest
+                return ended("energy_gain")
             if status == jg.Status.deep_overlap or tally.largest_overlap > DEEP_OVERLAP:
                 worst = "deep_overlap"
             if block:
                 mean = averages(tally, state.side**2, plan.grains, one.shear_rate)
                 found.append([float(mean[name]) for name in STRESSES])
-    return np.array(found), worst, deepest
+    return ended(worst)
 
 
 def pieces(steps: int) -> list[int]:
@@ -312,7 +330,7 @@ def gains(tally: jg.Tally, rise: float, rounding: float) -> bool:
 
 def by_peer(
     peer: Any, plan: Plan, flow: tuple[float, float], states: list[jg.State], setting: float
-) -> dict:
+) -> tuple[np.ndarray, dict]:
     """Stresses of the blocks of all seeds by another program, and how it failed."""
     failed = "collapse" if peer is event_driven else "nonfinite"
     (curve,), found = peer.CURVES, []
@@ -322,8 +340,8 @@ def by_peer(
             found += [one.advance()[: len(STRESSES)] for _ in range(plan.blocks + 1)][1:]
             one.close()
         except Exception as failure:  # of a program that is not ours to mend
-            return {"found": np.array(found), "outcome": failed, "detail": str(failure)}
-    return {"found": np.array(found), "outcome": "ok"}
+            return np.array(found), {"outcome": failed, "detail": str(failure)}
+    return np.array(found), {"outcome": "ok"}
 
 
 # ----------------------------------------------------------------------------------------------
@@ -331,15 +349,19 @@ def by_peer(
 
 
 def cells(rows: list[dict]) -> Iterator[tuple[float, float, str, float | None, str]]:
-    """α, ν and method of each cell, the coarsest setting from which on all are right, and the
-    outcome of the finest one.
+    """α, ν and method of each cell, the coarsest setting from which on all are right that are not
+    too slow, and the outcome of the finest one.
     """
     keys = dict.fromkeys((row["alpha"], row["nu"], row["method"]) for row in rows)
     for key in keys:
         column = [row for row in rows if (row["alpha"], row["nu"], row["method"]) == key]
-        wrong = [k for k, row in enumerate(column) if verdict(row) != "ok"]
-        right = column[max(wrong, default=-1) + 1 :]
-        yield *key, right[0]["setting"] if right else None, verdict(column[-1])
+        verdicts = [verdict(row) for row in column]
+        coarsest = None
+        for row, judged in zip(reversed(column), reversed(verdicts), strict=True):
+            if judged not in ("ok", "too_slow"):
+                break
+            coarsest = row["setting"] if judged == "ok" else coarsest
+        yield *key, coarsest, verdicts[-1]
 
 
 @styled
