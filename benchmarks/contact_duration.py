@@ -9,9 +9,6 @@ share of the contact pressure that jaxgran's clusters have. If dt were a duratio
 answers would be c dt with one c for all dt and flows. Between 1e-6 and 1e-3 each curve is also
 fitted by a power of its time.
 
-First the event-driven program itself, at t_c = 0 and N = 1000, is compared with the values of
-another one that ``validation`` has.
-
     python -m benchmarks contact_duration           # 19 minutes on two cores
     python -m benchmarks contact_duration --quick   # one flow of 64 grains, under a minute
 """
@@ -29,7 +26,6 @@ from matplotlib.figure import Figure
 import jaxgran as jg
 from benchmarks.independent.event_driven import Law, averages, discs_of, sheared
 from benchmarks.output import Output
-from benchmarks.validation import EVENT_DRIVEN, OBSERVABLES
 from jaxgran.environment import usable_cores
 from jaxgran.maps.schema import path_of
 from jaxgran.plotting.style import TWO_COLUMNS, styled
@@ -38,6 +34,7 @@ from jaxgran.statistics import standard_errors
 BLOCKS = 32  # of a sample, for its errors
 # of the solver: at the default, 1e-4, the collision rate of dense flows is a tenth too high
 TOLERANCE = 1e-6
+OBSERVABLES = ("granular_temperature", "pressure", "shear_stress")
 STEPPED = (*OBSERVABLES, "collision_rate", "force_ratio", "cluster_pressure_share")
 MATCHED = {"collision_rate": "collision_rate", "cluster_pressure_share": "elastic_pressure_share"}
 OF_DISCS = ("collision_rate", "elastic_pressure_share")  # what is fitted by powers
@@ -55,48 +52,32 @@ class Runs(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Flows, their runs, time steps and durations of contact (the longest first); flows and runs of
-    the reference.
-    """
+    """Flows, their runs, time steps and durations of contact (the longest first)."""
 
     restitution: tuple[float, ...]
     packing_fraction: tuple[float, ...]
     runs: Runs
     timesteps: tuple[float, ...]
     durations: tuple[float, ...]
-    reference: tuple[Flow, ...]
-    reference_runs: Runs
 
 
 TIMESTEPS = (1e-6, 1e-5, 1e-4, 1e-3)
 DURATIONS = (5e-3, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)  # at 1e-2 dense flows heat up without end
-FULL = Plan(
-    (0.2, 0.5),
-    (0.6, 0.75),
-    Runs(256, 3, 16.0),
-    TIMESTEPS,
-    DURATIONS,
-    tuple(EVENT_DRIVEN),
-    Runs(1000, 2, 50.0),
-)
-QUICK = Plan(
-    (0.2,), (0.6,), Runs(64, 2, 4.0), TIMESTEPS[2:], DURATIONS[:4], ((0.6, 0.7),), Runs(256, 2, 5.0)
-)
+FULL = Plan((0.2, 0.5), (0.6, 0.75), Runs(256, 3, 16.0), TIMESTEPS, DURATIONS)
+QUICK = Plan((0.2,), (0.6,), Runs(64, 2, 4.0), TIMESTEPS[2:], DURATIONS[:4])
 
 
 def run(output: Output) -> None:
-    """Run the plan on all cores, print both tables, and write ``contact_duration`` as JSON and
+    """Run the plan on all cores, print the tables, and write ``contact_duration`` as JSON and
     PNG.
     """
     plan, start = QUICK if output.quick else FULL, time.perf_counter()
     flows = list(product(plan.packing_fraction, plan.restitution))
     grains = stepped(plan)
-    tasks = [(flow, plan.reference_runs, (0.0,)) for flow in plan.reference]
-    tasks += [(flow, plan.runs, plan.durations) for flow in flows]
+    tasks = [(flow, plan.runs, plan.durations) for flow in flows]
     with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
-        done = list(pool.map(event_driven, *zip(*tasks, strict=True)))
-    reference = [compared(row) for rows in done[: len(plan.reference)] for row in rows]
-    discs = [row for rows in done[len(plan.reference) :] for row in rows]
+        done = pool.map(event_driven, *zip(*tasks, strict=True))
+        discs = [row for rows in done for row in rows]
     matches = [
         match
         for row in grains
@@ -108,9 +89,9 @@ def run(output: Output) -> None:
         for rows, names in ((discs, OF_DISCS), (grains, OF_GRAINS))
         for name in names
     ]
-    report(reference, matches, powers)
+    report(matches, powers)
     head = {"plan": plan._asdict(), "wall_seconds": time.perf_counter() - start}
-    head |= {"reference": reference, "matches": matches, "powers": powers, "event_driven": discs}
+    head |= {"matches": matches, "powers": powers, "event_driven": discs}
     output.write_rows("contact_duration", head, "jaxgran", grains)
     output.write_picture(draw(discs, grains), "contact_duration")
 
@@ -161,12 +142,6 @@ def stepped(plan: Plan) -> list[dict]:
             {"flow": [nu, alpha], "time": dt, "status": jg.Status(int(here.status)).name} | row
         )
     return rows
-
-
-def compared(row: dict) -> dict:
-    """A row of event-driven averages, beside the values of the other program."""
-    values = zip(OBSERVABLES, EVENT_DRIVEN[tuple(row["flow"])], strict=True)
-    return {"flow": row["flow"], **{name: [*row[name], reference] for name, reference in values}}
 
 
 def matched(row: dict, discs: list[dict]) -> list[dict]:
@@ -229,14 +204,8 @@ def fitted(rows: list[dict], flow: Flow, name: str) -> dict:
     return found
 
 
-def report(reference: list[dict], matches: list[dict], powers: list[dict]) -> None:
-    """Print the event-driven averages beside the others', the quotients t_c/dt, and the exponents
-    of all flows.
-    """
-    print("event-driven, N and strain as in the plan (the other program)")
-    for row in reference:
-        values = ("{:9.4f} ± {:6.4f} ({:6.4g})".format(*row[name]) for name in OBSERVABLES)
-        print("ν {:4g}  α {:3g}".format(*row["flow"]), *values)
+def report(matches: list[dict], powers: list[dict]) -> None:
+    """Print the quotients t_c/dt and the exponents of all flows."""
     print("t_c/dt of equal    collision rate         share of the pressure")
     for one, two in zip(matches[::2], matches[1::2], strict=True):
         texts = (

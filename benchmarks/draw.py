@@ -49,9 +49,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "speed_vs_accuracy": lambda: chart.draw(read("speed_vs_accuracy")),
     "stability": lambda: stability.draw(read("stability")["rows"]),
     "timestep_study": lambda: timestep_study.draw(read("timestep_study")["flows"]),
-    "validation": lambda: validation.draw(
-        read("validation")["rows"], read("contact_duration")["reference"]
-    ),
+    "validation": lambda: validation.draw(read("validation")["rows"]),
     **{
         f"paper_{name}": lambda draw=draw: draw(open_map(RESULTS / "paper.nc"))
         for name, draw in paper.FIGURES.items()

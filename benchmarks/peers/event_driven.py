@@ -31,7 +31,7 @@ def begin(discs: Discs, flow: Flow, curve: str, contact_duration: float, duratio
         nonlocal now
         now, sums = sheared(now, law, duration, most_collisions=most)
         found = averages(sums, now)
-        return Stress(*(found[name].item() for name in ("pressure", "shear_stress")))
+        return Stress(*(found[name].item() for name in Stress._fields if name in found))
 
     def current() -> Discs:
         return Discs(**{name: getattr(now, name) for name in Discs._fields})

@@ -35,6 +35,7 @@ def begin(discs: Discs, flow: Flow, curve: str, timestep: float, duration: float
             steps=round(duration / timestep),
         )
         now = now._replace(positions=positions, velocities=velocities, tilt=float(tilt))
-        return Stress(float(tally.pressure), float(tally.shear_stress))
+        averages = (tally.pressure, tally.shear_stress, tally.temperature, tally.force_ratio)
+        return Stress(*map(float, averages))
 
     return Run(advance, lambda: now)
