@@ -202,22 +202,6 @@ def rms(values: Sequence[float]) -> float:
     return math.sqrt(sum(value**2 for value in values) / len(values))
 
 
-def differences_in_sigmas(
-    rows: Iterable[Mapping[str, Any]], reference: Sequence[Mapping[str, Any]]
-) -> list[float]:
-    """Differences of the rows of ``validation`` from the flows of ``contact_duration``, in standard
-    errors of both.
-    """
-    pairs = (
-        over(
-            (row["value"], row["error"]),
-            at(reference, flow=[row["nu"], row["alpha"]])[row["observable"]],
-        )
-        for row in rows
-    )
-    return [difference / error for difference, error in pairs]
-
-
 def product_of(
     rows: Iterable[Mapping[str, Any]], timestep: float, flow: Sequence[float] = (0.2, 0.6)
 ) -> float:
@@ -316,7 +300,6 @@ for _functions in (
         product_of,
         wave_exponent,
         shares_of_clusters,
-        differences_in_sigmas,
     ),
 ):
     ENVIRONMENT.globals |= {one.__name__: one for one in _functions}

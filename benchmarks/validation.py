@@ -73,6 +73,7 @@ def run(output: Output) -> None:
                 print("α = {:g}, ν = {:g}".format(*flow), {**row, "flow": flow}, flush=True)
     rows.sort(key=lambda row: plan.flows.index((row["alpha"], row["nu"])))
     head = {**plan._asdict(), "timestep": TIMESTEP}
+    head["programs"] = {name: summary(rows, name) for name in PROGRAMS}
     output.write_rows("validation", head, "rows", rows)
     output.write_picture(draw(rows), "validation")
 
@@ -143,11 +144,20 @@ def means(
     }
 
 
-def sigmas(rows: list[dict]) -> list[float]:
-    """Differences in standard errors of both programs."""
-    return [
-        row["difference"][0] / row["difference"][1] for row in rows if row["observable"] is not None
-    ]
+def summary(rows: list[dict], program: str) -> dict[str, float]:
+    """Flows that a program finishes, the averages compared in them, and the largest and the root
+    mean square of the differences in standard errors of both.
+    """
+    compared = [row for row in rows if row["program"] == program and row["observable"] is not None]
+    sigmas = np.array(
+        [difference / error for difference, error in (row["difference"] for row in compared)]
+    )
+    return {
+        "flows": len({(row["alpha"], row["nu"]) for row in compared}),
+        "averages": len(compared),
+        "largest_in_standard_errors": float(np.max(abs(sigmas))),
+        "rms_in_standard_errors": float(np.sqrt(np.mean(sigmas**2))),
+    }
 
 
 @styled
