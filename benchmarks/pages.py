@@ -224,21 +224,6 @@ def ranked(
     return sorted(rows, key=lambda row: row["seconds"])
 
 
-def shares_of_clusters(
-    excesses: Iterable[float] = (0.1, 0.25, 0.45, 0.77, 1.6, 4.0),
-) -> list[tuple[float, float]]:
-    """Excess and share of clusters in the contact pressure, at the points of the paper's map
-    nearest to these.
-    """
-    data = _map("paper.nc")
-    found = np.stack(
-        [np.ravel(data.force_ratio - 1), np.ravel(data["stresses/cluster_pressure_share"])], axis=1
-    )
-    return [
-        tuple(min(found.tolist(), key=lambda point: abs(point[0] - excess))) for excess in excesses
-    ]
-
-
 def quotients(rows: Iterable[Mapping[str, float]], one: str, other: str) -> list[float]:
     """One column over another."""
     return [row[one] / row[other] for row in rows]
@@ -299,7 +284,6 @@ for _functions in (
         output_of_where,
         product_of,
         wave_exponent,
-        shares_of_clusters,
     ),
 ):
     ENVIRONMENT.globals |= {one.__name__: one for one in _functions}
