@@ -7,8 +7,8 @@ maximum likelihood. Stresses, temperatures and dissipation rate are extrapolated
 (``sampling.budget.SIZE_LAWS``), and the error of that is in the bound; force ratio and factors are
 those of the map's numbers of grains. The better of two theories, whose pressure is within 10 % in
 most of the plane, becomes a Chebyshev series in ``theory.csv``, and so does the corrected theory.
-Then the intervals are judged: on points of the map that are left out, and on the fresh flows of
-``python -m benchmarks reference_runs``. The maps of the paper and of a coarse time step give the
+Then the intervals are judged: on points of the map that are left out, and on the fresh and the
+large flows of ``python -m benchmarks reference_runs``. The maps of the paper and of a coarse time step give the
 force ratio at other time steps.
 
     python -m benchmarks reference          # from benchmarks/results/reference.nc, in two minutes
@@ -71,12 +71,15 @@ def run(output: Output) -> None:
     made_from = {"map": SOURCE, "table commit": output.hardware["commit"]}
     make_table(jg.open_map(RESULTS / SOURCE), others, folder, made_from)
     table = read_table(folder)
-    fresh = json.loads((RESULTS / "reference_runs.json").read_text())
+    fresh, large = (
+        json.loads((RESULTS / f"reference_runs{end}.json").read_text()) for end in ("", "_large")
+    )
     rows = list(judged(table, fresh["rows"]))
     head = {"table": table.head, "left_out": left_out(table), "plane": plane(table)}
     head |= {
         "fresh": {key: fresh[key] for key in ("points", "grains", "timestep")},
         "coverage": coverage(rows),
+        "large": {"grains": large["grains"], "rows": list(judged(table, large["rows"]))},
     }
     head |= {"whole_errors": whole_errors(table)}
     for name, found in (
