@@ -8,8 +8,8 @@ maximum likelihood. Stresses, temperatures and dissipation rate are extrapolated
 those of the map's numbers of grains. The better of two theories, whose pressure is within 10 % in
 most of the plane, becomes a Chebyshev series in ``theory.csv``, and so does the corrected theory.
 Then the intervals are judged: on points of the map that are left out, and on the fresh and the
-large flows of ``python -m benchmarks reference_runs``. The maps of the paper and of a coarse time step give the
-force ratio at other time steps.
+large flows of ``python -m benchmarks reference_runs``. The maps of the paper and of a coarse time
+step give the force ratio at other time steps.
 
     python -m benchmarks reference          # from benchmarks/results/reference.nc, in two minutes
     python -m benchmarks reference --replace  # and into jaxgran/reference
