@@ -38,7 +38,8 @@ def test_a_setting_is_silent_only_if_nothing_tells_that_it_is_wrong() -> None:
     for errors, outcome, judged in (
         ([[0.01, 0.01], [-0.04, 0.01]], "ok", "ok"),
         ([[0.01, 0.01], [-0.04, 0.01]], "deep_overlap", "ok"),
-        ([[0.01, 0.01], [-0.06, 0.01]], "ok", "silent"),
+        ([[0.01, 0.01], [-0.055, 0.01]], "ok", "ok"),
+        ([[0.01, 0.01], [-0.07, 0.01]], "ok", "silent"),
         ([[0.2, 0.01], [0.0, 0.01]], "deep_overlap", "deep_overlap"),
         ([[0.0, 0.01], [0.0, 0.01]], "iteration_limit", "iteration_limit"),
         (None, "ok", "silent"),
