@@ -6,8 +6,8 @@ stiffness k of soft discs; event-driven discs have none. From the same steady st
 256 discs, every setting is sheared on, and pressure and shear stress are compared with a reference:
 the default at dt = 1e-4 and a tolerance of 1e-6. A cell of the figure is the coarsest setting that
 is right: both stresses within 5 % and one standard error, of one to three per cent, there and at
-the next finer setting, with which the search ends. Where none is, its letter says what happened at the finest
-setting (``OUTCOMES``).
+the next finer setting, with which the search ends. Where none is, its letter says what happened at
+the finest setting (``OUTCOMES``).
 
 Contact dynamics is stopped by the first block of strain that fails: a solve above the tolerance, no
 impulses, too many contacts, a number that is not finite, or energy that was gained, which is a
