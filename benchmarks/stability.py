@@ -15,7 +15,7 @@ negative dissipation, or kinetic energy beyond the shear work less the dissipati
 too, where it takes more than ``SLOW``. A setting is silent if it is wrong without any of these, and
 without deep overlaps.
 
-    python -m benchmarks stability            # about an hour on two cores
+    python -m benchmarks stability            # about half an hour on two cores
     python -m benchmarks stability --quick    # two flows of 64 grains, about two minutes
 """
 
@@ -392,7 +392,8 @@ def draw(rows: list[dict]) -> Figure:
     key = "   ".join(
         f"{OUTCOMES[name][0]}  {OUTCOMES[name][1]}" for name in OUTCOMES if name in letters
     )
-    axes.set_xlabel(key, fontsize=SMALL_SIZE)
+    units = r"numbers: $\mathrm{d}t$ in $1/\dot\gamma$; of soft discs $k$ in $m\dot\gamma^2$"
+    axes.set_xlabel(f"{units}\n{key}", fontsize=SMALL_SIZE)
     return figure
 
 
