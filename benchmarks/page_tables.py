@@ -14,9 +14,7 @@ from typing import Any
 from benchmarks.output import ROOT
 from benchmarks.registry import BENCHMARKS
 from jaxgran.cli.options import option_name, with_options
-from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.schema import path_of
-from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.settings import options as parameters
 from jaxgran.maps.variables import COORDINATES, VARIABLES
 from jaxgran.sampling.observables import OBSERVABLES, Observables
@@ -36,29 +34,23 @@ def unit_of(unit: str | None) -> str:
 
 
 def variables(group: str) -> str:
-    """A table of the variables of a group of a map, with the formulas of averages and the names of
-    their errors.
+    """A table of the variables of a group of a map, with the formulas of averages.
+
+    Those of a large system and kinetic theory's predictions, which repeat a name, have no row.
     """
-    rows = {row.path.rpartition("/")[2]: row for row in VARIABLES if row.group == group}
-    data = map_dataset(MapSettings((0.5,), (0.6,), timestep=1e-3), {}, {})
-    names = map(str, data[group].data_vars) if group == "/" or group in data.children else ()
-    endings: dict[str, list[str]] = {name: [] for name in rows}
-    for name in names:
-        if name not in rows:
-            owner = max((row for row in rows if name.startswith(row)), key=len)
-            endings[owner].append(f"`{name.removeprefix(owner)}`")
-    lines = [
-        "| name | dimensions | unit | meaning | formula | errors |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
-    for name, row in rows.items():
-        formula = (
-            f"`{formulas()[name]}`" if path_of(name) == row.path and name in OBSERVABLES else ""
-        )
-        dims, errors = ", ".join(f"`{dim}`" for dim in row.dims), ", ".join(endings[name])
-        cells = f"`{name}`", dims, unit_of(row.unit), row.meaning, formula, errors
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    header = ("name", "dimensions", "unit", "meaning", "formula")
+    rows = []
+    for row in VARIABLES:
+        name = row.path.rpartition("/")[2]
+        repeats = "_large_system" in name or row.meaning.startswith("kinetic theory's prediction")
+        if row.group == group and not repeats:
+            measured = path_of(name) == row.path and name in OBSERVABLES
+            formula = f"`{formulas()[name]}`" if measured else ""
+            dims = ", ".join(f"`{dim}`" for dim in row.dims)
+            rows.append((f"`{name}`", dims, unit_of(row.unit), row.meaning, formula))
+    shown = [k for k in range(len(header)) if any(row[k] for row in rows)]
+    lines = [header, ("---",) * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line[k] for k in shown)} |" for line in lines)
 
 
 @cache
