@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-import jupytext
 import numpy as np
 import pytest
 from flows import GRAINS
-from test_docs import ROOT
+from test_docs import python_of
 
 import jaxgran as jg
 from jaxgran.model.cell import displacement
@@ -143,14 +142,13 @@ def test_batch_is_refused_and_vmap_applies(state: State) -> None:
     )
 
 
-def test_simulator_of_the_notebook_has_the_impulses_of_a_sample(monkeypatch) -> None:
-    """Over 40 steps, to ten tolerances of the solver: later, flows of many collisions diverge."""
-    monkeypatch.setenv("QUICK", "1")
-    cells = jupytext.read(ROOT / "notebooks" / "05_simulator_from_parts.py").cells
-    code = "\n".join(cell.source for cell in cells if cell.cell_type == "code")
+def test_simulator_from_parts_has_the_impulses_of_a_sample() -> None:
+    """Over the 40 steps of its page, to ten tolerances of the solver: later, flows of many
+    collisions diverge.
+    """
     names: dict = {}
-    exec(code[: code.index("plt.rcParams")], names)
-    assert names["steps"] == 40
-    expected = np.concatenate([names["tally"].impulse, names["tally"].binary_impulse], axis=1)
-    np.testing.assert_allclose(names["sums"][:, :2], expected, rtol=10 * names["solver"].tolerance)
-    assert np.all(expected > 0)
+    exec("\n".join(python_of("how-to/jax-md.md")), names)
+    tally, sums = names["samples"].tally, names["sums"]
+    expected = np.concatenate([tally.impulse, tally.binary_impulse], axis=1)
+    np.testing.assert_allclose(sums[:, :2], expected, rtol=10 * names["solver"].tolerance)
+    assert np.all(expected > 0) and not np.any(sums[:, 2])
