@@ -1,4 +1,4 @@
-"""Tables of pages that are read from the code: observables, variables of a map, options, examples,
+"""Tables of pages that are read from the code: variables of a map, options, examples,
 benchmarks and notebooks.
 """
 
@@ -20,15 +20,6 @@ from jaxgran.maps.variables import COORDINATES, VARIABLES
 from jaxgran.sampling.observables import OBSERVABLES, Observables
 
 
-def observables() -> str:
-    """A table of what is measured."""
-    rows = ["| name | unit | group in the file of a map | meaning |", "| --- | --- | --- | --- |"]
-    for name, row in OBSERVABLES.items():
-        group = "root" if row.group == "/" else row.group
-        rows.append(f"| `{name}` | {unit_of(row.unit)} | {group} | {row.meaning} |")
-    return "\n".join(rows)
-
-
 def unit_of(unit: str | None) -> str:
     return "–" if unit in ("1", None) else unit
 
@@ -36,14 +27,19 @@ def unit_of(unit: str | None) -> str:
 def variables(group: str) -> str:
     """A table of the variables of a group of a map, with the formulas of averages.
 
-    Those of a large system and kinetic theory's predictions, which repeat a name, have no row.
+    Families of names (of a large system, kinetic theory's predictions, Enskog's factors) have no
+    row.
     """
     header = ("name", "dimensions", "unit", "meaning", "formula")
     rows = []
     for row in VARIABLES:
         name = row.path.rpartition("/")[2]
-        repeats = "_large_system" in name or row.meaning.startswith("kinetic theory's prediction")
-        if row.group == group and not repeats:
+        family = (
+            "_large_system" in name
+            or name.startswith("enskog_factor_")
+            or row.meaning.startswith("kinetic theory's prediction")
+        )
+        if row.group == group and not family:
             measured = path_of(name) == row.path and name in OBSERVABLES
             formula = f"`{formulas()[name]}`" if measured else ""
             dims = ", ".join(f"`{dim}`" for dim in row.dims)
@@ -80,8 +76,14 @@ def table_of(command: str, kind: str) -> Any:
 
 
 def options(command: str) -> str:
-    """A table of the options of a command."""
+    """A table of the options of a command, but for those that are the same for ``map``."""
+    shared = [] if command == "map" else option_rows("map")
     rows = ["| option | meaning | default |", "| --- | --- | --- |"]
+    return "\n".join([*rows, *(row for row in option_rows(command) if row not in shared)])
+
+
+def option_rows(command: str) -> list[str]:
+    rows = []
     for name, one in table_of(command, "OPTIONS").items():
         flag = f"-{one.short}, {option_name(name)}" if one.short else option_name(name)
         meaning = with_options(one.help, parameters(command))
@@ -94,7 +96,7 @@ def options(command: str) -> str:
         elif one.off:
             flag += f", --no-{name}"
         rows.append(f"| `{flag}` | {meaning} | {one.default or '–'} |")
-    return "\n".join(rows)
+    return rows
 
 
 def examples(command: str) -> str:

@@ -290,7 +290,7 @@ for _functions in (
 ENVIRONMENT.globals |= {
     name: getattr(page_tables, name)
     for name in (
-        *("observables", "variables", "coordinates", "options"),
+        *("variables", "coordinates", "options"),
         *("examples", "benchmarks", "notebooks"),
     )
 }
