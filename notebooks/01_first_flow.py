@@ -105,8 +105,8 @@ jg.flow_figure(seen)
 # ## The force ratio
 #
 # Two grains that collide alone exchange the binary impulse (1 + α) m₁₂ u, with their reduced mass
-# m₁₂ and their speed of approach u. The force ratio is the sum of all contact impulses over the sum of
-# the binary impulses of the same contacts. Taken from the snapshots by hand, it is that of
+# m₁₂ and their speed of approach u. The force ratio is the sum of all contact impulses over the sum
+# of the binary impulses of the same contacts. Taken from the snapshots by hand, it is that of
 # `jg.sample` over the same steps:
 
 # %%

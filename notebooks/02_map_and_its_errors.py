@@ -183,5 +183,5 @@ plt.show()
 # %% [markdown]
 # Filled symbols: force ratio below 1.05. Grey: 10 %. Bars: 95 % intervals for a large system.
 #
-# **Collisions are binary in loose or nearly elastic flows, and the intervals say how sure that is.**
+# **Collisions are binary in loose or nearly elastic flows; the intervals say how sure that is.**
 # The theory fails well below the lowest contour of the force ratio; the next notebook says why.
