@@ -13,8 +13,7 @@ their long waves need a preparation of 250 strains. Nothing is fitted to any of 
 import multiprocessing
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
+from concurrent.futures import ProcessPoolExecutor, as_completed
 
 import numpy as np
 import xarray as xr
@@ -41,33 +40,34 @@ QUICK_LARGE = {"grains": 400, "timestep": 1e-3, "equilibrate": 1.0, "strain": 8.
 
 
 def run(output: Output, part: str = "random") -> None:
-    """Run the flows of a part, print each, and write them as JSON."""
+    """Run the flows of a part, print each, and write them as JSON; large flows as they end."""
     start = time.perf_counter()
-    if part == "large":
-        plan = QUICK_LARGE if output.quick else LARGE
-        with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
-            rows = list(pool.map(partial(large_row, plan), LARGE_FLOWS))
-        name = "reference_runs_large"
-    else:
-        plan, name, rows = QUICK if output.quick else FULL, "reference_runs", []
-        for row in fresh_rows(**plan):
-            rows.append(row)
-            print(
-                f"{len(rows)} of {plan['points']}: {row}, {time.perf_counter() - start:.0f} s",
-                flush=True,
-            )
-    head = {**plan, "first_seed": FIRST_SEED, "seconds": round(time.perf_counter() - start)}
-    output.write_rows(name, head, "rows", rows)
+    large = part == "large"
+    plan = {True: (LARGE, QUICK_LARGE), False: (FULL, QUICK)}[large][output.quick]
+    name = "reference_runs_large" if large else "reference_runs"
+    rows: list[dict] = []
+    for row in large_rows(plan) if large else fresh_rows(**plan):
+        rows.append(row)
+        seconds = time.perf_counter() - start
+        print(f"{len(rows)}: {row}, {seconds:.0f} s", flush=True)
+        if large or len(rows) == plan["points"]:
+            head = {**plan, "first_seed": FIRST_SEED, "seconds": round(seconds)}
+            output.write_rows(name, head, "rows", rows)
+
+
+def large_rows(plan: dict) -> Iterator[dict]:
+    """Averages of the large flows on all cores, in the order in which they end."""
+    with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
+        for future in as_completed(pool.submit(large_row, plan, flow) for flow in LARGE_FLOWS):
+            yield future.result()
 
 
 def large_row(plan: dict, flow: tuple[float, float]) -> dict:
-    """Averages of a large flow, printed when it is done."""
+    """Averages of a large flow."""
     one = {"restitution": flow[0], "packing_fraction": flow[1], "grains": plan["grains"]}
     begin = time.process_time()
     data = jg.ratio_map(**(plan | one), seeds=1, first_seed=FIRST_SEED, workers=1)
-    row = one | _row(data) | {"cpu_seconds": round(time.process_time() - begin)}
-    print(row, flush=True)
-    return row
+    return one | _row(data) | {"cpu_seconds": round(time.process_time() - begin)}
 
 
 def random_points(count: int) -> Iterator[tuple[float, float]]:

@@ -120,26 +120,6 @@ BENCHMARKS = (
         ("dissipation.json", "dissipation.png"),
     ),
     Benchmark(
-        "dense_rheology",
-        "What are friction and pressure of 1000 grains between ν = 0.79 and 0.83?",
-        (10, 1),
-        ("dense_rheology.json",),
-    ),
-    Benchmark(
-        "dense_flows",
-        "What are friction and pressure of 4000 grains between ν = 0.83 and jamming?",
-        (60, 0.5),
-        ("dense_flows.json",),
-        one_core=True,
-    ),
-    Benchmark(
-        "dense_limit",
-        "Are dense flows compatible with the exponents that are published for the jamming "
-        "transition?",
-        (0.1, 0.1),
-        ("dense_limit.json", "dense_limit.png"),
-    ),
-    Benchmark(
         "flow_picture",
         "What do the forces between grains look like at restitutions 0.9 and 0.1?",
         (2, 1),

@@ -104,9 +104,9 @@ jg.flow_figure(seen)
 # %% [markdown]
 # ## The force ratio
 #
-# Two grains that collide alone exchange the binary impulse (1 + α) μ u, with their reduced mass μ
-# and their speed of approach u. The force ratio is the sum of all contact impulses over the sum of
-# the binary impulses of the same contacts. Taken from the snapshots by hand, it is that of
+# Two grains that collide alone exchange the binary impulse (1 + α) m₁₂ u, with their reduced mass
+# m₁₂ and their speed of approach u. The force ratio is the sum of all contact impulses over the sum
+# of the binary impulses of the same contacts. Taken from the snapshots by hand, it is that of
 # `jg.sample` over the same steps:
 
 # %%
@@ -189,3 +189,8 @@ for panel, (name, label) in zip(axes, labels.items(), strict=True):
 axes[0].axhline(1, color="0.6", lw=0.8)
 axes[1].set(xscale="log", xlabel=r"time step $\dot\gamma\,\mathrm{d}t$")
 plt.show()
+
+# %% [markdown]
+# **Contacts carry it: in nearly elastic flow one pair at a time, in dissipative flow clusters that
+# push at once.** The force ratio says how much more these push than the same pairs would alone. It
+# falls as the time step becomes shorter, and the pressure does not.

@@ -181,5 +181,7 @@ figure.legend(loc="outside upper center", ncols=len(restitution), handletextpad=
 plt.show()
 
 # %% [markdown]
-# Filled symbols: force ratio below 1.05. Grey: 10 %. Bars: 95 % intervals for a large system. The
-# theory fails well below the lowest contour of the force ratio, and the next notebook says why.
+# Filled symbols: force ratio below 1.05. Grey: 10 %. Bars: 95 % intervals for a large system.
+#
+# **Collisions are binary in loose or nearly elastic flows; the intervals say how sure that is.**
+# The theory fails well below the lowest contour of the force ratio; the next notebook says why.

@@ -224,5 +224,8 @@ plt.show()
 
 # %% [markdown]
 # Bars: the scatter of the laws in other flows that were not fitted, and one standard error of what
-# was measured. The rightmost point is nearly elastic and dense, where flows are more viscous than
-# in Enskog's theory.
+# was measured. The rightmost point is nearly elastic and dense.
+#
+# **Kinetic theory fails because grains that collide approach more slowly than independent ones, and
+# because more pairs are at contact than in equilibrium.** A law of each, of α and ν alone, mends
+# most of it, but not nearly elastic, dense flow, which is more viscous than in Enskog's theory.

@@ -62,7 +62,7 @@ def loads_of_grains(
 def delassus_product(
     contacts: Contacts, impulses: Float[Array, " contacts"], grains: int
 ) -> Float[Array, " contacts"]:
-    """Change W p of the relative normal velocities that the impulses cause."""
+    """Change W J of the relative normal velocities that the impulses cause."""
     total = grain_impulses(contacts, impulses, grains)
     change = taken(total, contacts.i) * contacts.inverse_mass_i[:, None]
     change -= taken(total, contacts.j) * contacts.inverse_mass_j[:, None]

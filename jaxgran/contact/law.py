@@ -23,7 +23,7 @@ Number = Any  # a number, or an array of them
 LONGEST_STRIDE = 1e4
 WINDOW = 100  # iterations after which the progress of that method is judged
 PROGRESS = 0.5  # factor by which the best residual must have fallen within a window
-# pᵀWp over −pᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
+# JᵀWJ over −Jᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
 JAMMED_RESPONSE = 1e-2
 ABSOLUTE_RESIDUAL = 10  # roundings of the velocity γ̇σ that a residual may always keep
 
@@ -186,7 +186,7 @@ def contact_terms(
       approach: relative normal velocity u⁻ before the step.
       half_change: half its change by the impulses, (u⁺ − u⁻)/2.
       one_plus_alpha: 1 + α.
-      impulse, binary_impulse: p = (1 + α) p₀, and the same if the collision were binary.
+      impulse, binary_impulse: J = (1 + α) J₀, and the same if the collision were binary.
       clustered: the impulse p where the contact is in a cluster, otherwise 0.
       used, loaded, approaching: 1 where it is a contact, carries an impulse, approaches; otherwise
         0.

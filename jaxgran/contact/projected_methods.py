@@ -1,21 +1,21 @@
 """The projected methods: how one iterate of a contact solve follows from those before it.
 
-All of them take projected steps p ← max(0, y − τ D⁻¹(W y + b)) from a point y, with the diagonal D
+All of them take projected steps J ← max(0, y − t D⁻¹(W y + u⁻)) from a point y, with the diagonal D
 of ``delassus.spectral_bound``, and cost one product with W each. They differ in y and in the step
-length τ:
+length t:
 
 =================  ==============================  =================================================
-method             point y                         step length τ
+method             point y                         step length t
 =================  ==============================  =================================================
-Jacobi             p                               relaxation ω
-Nesterov           p + k/(k+3) (p − p_before)      1; k restarts when the step turns uphill
-BarzilaiBorwein    p                               curvature along the last step; guarded
+Jacobi             J                               relaxation ω
+Nesterov           J + k/(k+3) (J − J_before)      1; k restarts when the step turns uphill
+BarzilaiBorwein    J                               curvature along the last step; guarded
 =================  ==============================  =================================================
 
-Where W ⪯ D, a Jacobi step lowers ½pᵀWp + bᵀp for every ω < 2, and Nesterov's method converges at τ
-= 1. With diag(W) neither holds (``benchmarks/stability.py``).
+Where W ⪯ D, a Jacobi step lowers ½JᵀWJ + (u⁻)ᵀJ for every ω < 2, and Nesterov's method converges at
+t = 1. With diag(W) neither holds (``benchmarks/stability.py``).
 
-Barzilai and Borwein take τ from the last step s: sᵀDs/sᵀWs and sᵀWs/(Ws)ᵀD⁻¹(Ws) in turn, both at
+Barzilai and Borwein take t from the last step s: sᵀDs/sᵀWs and sᵀWs/(Ws)ᵀD⁻¹(Ws) in turn, both at
 least 1 as W ⪯ D. The objective does not fall in every step, and with a projection the iterates can
 cycle. The safeguard needs no values of the objective: where the best residual has not halved over
 100 steps, the method continues as Nesterov's. So either the residual falls at that rate, or the
@@ -45,7 +45,7 @@ from jaxgran.model.choices import SolverName
 
 
 class Iterate(NamedTuple):
-    """State of the iteration; a point holds impulses and their response W p."""
+    """State of the iteration; a point holds impulses and their response W J."""
 
     point: Float[Array, "2 contacts"]
     previous: Float[Array, "2 contacts"]
@@ -56,20 +56,20 @@ class Iterate(NamedTuple):
 
 @dataclass(frozen=True)
 class ProjectedMethod:
-    """Base class of the methods that solve the contacts of a step: 0 ≤ p ⟂ W p + b ≥ 0.
+    """Base class of the methods that solve the contacts of a step: 0 ≤ J ⟂ W J + u⁻ ≥ 0.
 
     ==========  =====  ====  =======================================================================
     field       shape  unit  meaning
     ==========  =====  ====  =======================================================================
-    tolerance   ()     –     relative residual ‖min(diag(W) p, W p + b)‖ / ‖min(b, 0)‖ to reach,
+    tolerance   ()     –     relative residual ‖min(diag(W) J, W J + u⁻)‖ / ‖min(u⁻, 0)‖ to reach,
                              1e-12 to 0.1; ``law.residual_target`` adds what is lost in rounding
     max_steps   ()     –     largest number of iterations; the best iterate is then returned, with a
                              status
     ==========  =====  ====  =======================================================================
 
-    Each iteration is a projected step p ← max(0, y − τ D⁻¹(W y + b)). A subclass says what D, y and
-    τ are, by overriding one or more of ``bound``, ``init``, ``propose`` and ``learn``. What is
-    inherited is Jacobi's method with D the spectral bound and τ = 1. A subclass is a frozen
+    Each iteration is a projected step J ← max(0, y − t D⁻¹(W y + u⁻)). A subclass says what D, y
+    and t are, by overriding one or more of ``bound``, ``init``, ``propose`` and ``learn``. What is
+    inherited is Jacobi's method with D the spectral bound and t = 1. A subclass is a frozen
     dataclass. It is a JAX pytree whose fields are traced: other numbers recompile nothing. A field
     with ``metadata={"static": True}`` is static.
 
@@ -77,7 +77,7 @@ class ProjectedMethod:
       InputError: (a ValueError) a number is outside its range; traced numbers are not checked.
 
     Examples:
-      Momentum of a constant share β, y = p + β (p − p_before), with τ = 1:
+      Momentum of a constant share β, y = J + β (J − J_before), with t = 1:
 
       >>> @dataclass(frozen=True)
       ... class ConstantMomentum(ProjectedMethod):
@@ -122,12 +122,12 @@ class ProjectedMethod:
 
     def init(self, approach: Float[Array, " contacts"]) -> Any:
         """What the method remembers between iterations, at the start: a pytree of floats;
-        ``approach`` is b.
+        ``approach`` is u⁻.
         """
         return ()
 
     def propose(self, now: Iterate) -> tuple[Float[Array, "2 contacts"], float | Float[Array, ""]]:
-        """Point y, as impulses and their response W y, and step length τ."""
+        """Point y, as impulses and their response W y, and step length t."""
         return now.point, 1.0
 
     def learn(
@@ -144,7 +144,7 @@ class ProjectedMethod:
           now: the state before the step.
           start, point: y and p, each with its response.
           bound: the diagonal D.
-          best_residual: ‖min(diag(W) p, W p + b)‖, the smallest so far, in σγ̇.
+          best_residual: ‖min(diag(W) J, W J + u⁻)‖, the smallest so far, in σγ̇.
         """
         return now.memory
 
@@ -177,7 +177,7 @@ _register(ProjectedMethod)
 class _GuardedSteps(NamedTuple):
     """What ``BarzilaiBorwein`` remembers.
 
-    stride: step length τ.
+    stride: step length t.
     guarded: 1 where Nesterov's method has taken over, otherwise 0.
     k: steps of Nesterov's method since its last restart.
     last_residual: the best residual at the end of the last window.

@@ -1,7 +1,7 @@
 """Any frictionless contact problem: solved by the methods of the engines, and residuals of impulses
 by the definitions in use.
 
-With w = u⁺ + α u⁻ = W p + (1 + α) u⁻ the law is 0 ≤ p ⟂ w ≥ 0. All residuals are made dimensionless
+With w = u⁺ + α u⁻ = W J + (1 + α) u⁻ the law is 0 ≤ J ⟂ w ≥ 0. All residuals are made dimensionless
 by what stops every contact by itself: the speed v = (1 + α) ‖min(u⁻, 0)‖ and the energy
 E = (1 + α)² Σ min(u⁻, 0)²/W_cc. So they do not depend on units, and a list of problems has
 comparable numbers.
@@ -78,8 +78,8 @@ class ContactSolution:
     ==========  ================  ====  =========================================================
     field       shape             unit  meaning
     ==========  ================  ====  =========================================================
-    impulses    (contacts,)       mσγ̇   impulses p = (1 + α) p₀, never negative
-    velocities  (contacts,)       σγ̇    relative normal velocities u⁺ = u⁻ + W p after
+    impulses    (contacts,)       mσγ̇   impulses J = (1 + α) J₀, never negative
+    velocities  (contacts,)       σγ̇    relative normal velocities u⁺ = u⁻ + W J after
     residuals   ContactResiduals  –     by each definition in use
     iterations  ()                –     products with W
     status      ()                –     ok, iteration_limit, infeasible or nonfinite: see Status
@@ -100,7 +100,7 @@ def solve_contacts(
     restitution: float | Array = 0.0,
     solver: ProjectedMethod = _DEFAULT,
 ) -> ContactSolution:
-    """Impulses of a frictionless contact problem: 0 ≤ p ⟂ u⁺ + α u⁻ ≥ 0 with u⁺ = u⁻ + W p.
+    """Impulses of a frictionless contact problem: 0 ≤ J ⟂ u⁺ + α u⁻ ≥ 0 with u⁺ = u⁻ + W J.
 
     ===========  ===============================  ==================================================
     argument     type or shape                    meaning
@@ -117,8 +117,8 @@ def solve_contacts(
     less. Where impulses are not unique, as in a cluster with more contacts than degrees of freedom,
     velocities are, and one solution is returned.
 
-    With one α for all contacts no solution gains energy: it changes by −½ (1 − α²) p₀ᵀ W p₀, where
-    p₀ is the solution at α = 0. A tolerance below the rounding of the velocities is met at 10
+    With one α for all contacts no solution gains energy: it changes by −½ (1 − α²) J₀ᵀ W J₀, where
+    J₀ is the solution at α = 0. A tolerance below the rounding of the velocities is met at 10
     roundings of the largest |u⁻|.
 
     Raises:

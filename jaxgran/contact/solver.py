@@ -2,16 +2,16 @@
 
 With normal impulses p and the Delassus operator W = H M⁻¹ Hᵀ the contact law of a step is
 
-    u⁺ = u⁻ + W p,    0 ≤ p ⟂ u⁺ + α u⁻ ≥ 0.
+    u⁺ = u⁻ + W J,    0 ≤ J ⟂ u⁺ + α u⁻ ≥ 0.
 
-Its solution is p = (1 + α) p₀, where p₀ solves it at α = 0; so only 0 ≤ p₀ ⟂ W p₀ + u⁻ ≥ 0 is ever
+Its solution is J = (1 + α) J₀, where J₀ solves it at α = 0; so only 0 ≤ J₀ ⟂ W J₀ + u⁻ ≥ 0 is ever
 solved.
 
-Derivatives do not go through the iteration. On the contacts that press, A = {p₀ > 0}, the solution
-satisfies W_AA p₀ + u⁻_A = 0, and every small change keeps it so where no contact is about to press
+Derivatives do not go through the iteration. On the contacts that press, A = {J₀ > 0}, the solution
+satisfies W_AA J₀ + u⁻_A = 0, and every small change keeps it so where no contact is about to press
 or to part:
 
-    W_AA dp₀ = −(dW p₀ + du⁻)_A,    dp₀ = 0 elsewhere.
+    W_AA dJ₀ = −(dW J₀ + du⁻)_A,    dJ₀ = 0 elsewhere.
 
 This linear system is solved by conjugate gradients, in forward and in reverse mode, whose memory
 does not depend on the iterations. Where W_AA is singular, as in a cluster with more contacts than
@@ -48,9 +48,9 @@ _DERIVATIVE_ITERATIONS = 50  # at most, for each slot of a contact
 class Solution:
     """Result of one contact solve."""
 
-    impulses: Float[Array, " contacts"]  # p₀ at restitution zero, never negative
-    response: Float[Array, " contacts"]  # velocity change W p₀ of the contacts
-    residual: Float[Array, ""]  # ‖min(diag(W) p, W p + u⁻)‖ over ‖min(u⁻, 0)‖
+    impulses: Float[Array, " contacts"]  # J₀ at restitution zero, never negative
+    response: Float[Array, " contacts"]  # velocity change W J₀ of the contacts
+    residual: Float[Array, ""]  # ‖min(diag(W) J, W J + u⁻)‖ over ‖min(u⁻, 0)‖
     iterations: Int[Array, ""]  # products with W
     status: Int[Array, ""]  # ok, iteration_limit, infeasible or nonfinite
 
@@ -63,7 +63,7 @@ def solve(
     solver: ProjectedMethod,
     active: Array,
 ) -> Solution:
-    """Impulses p₀ of the network at restitution zero: 0 ≤ p₀ ⟂ W p₀ + u⁻ ≥ 0.
+    """Impulses J₀ of the network at restitution zero: 0 ≤ J₀ ⟂ W J₀ + u⁻ ≥ 0.
 
     Args:
       contacts: the network, or a problem given by its matrix.

@@ -21,8 +21,8 @@ class Impulses(NamedTuple):
     ========  ===========  ====  ==========================================================
     field     shape        unit  meaning
     ========  ===========  ====  ==========================================================
-    contacts  (contacts,)  mσγ̇   p = (1 + α) p₀
-    binary    (contacts,)  mσγ̇   (1 + α) μ₁₂ max(0, −u⁻), if every collision were binary
+    contacts  (contacts,)  mσγ̇   J = (1 + α) J₀
+    binary    (contacts,)  mσγ̇   (1 + α) m₁₂ max(0, −u⁻), if every collision were binary
     changes   (contacts,)  σγ̇    u⁺ − u⁻, change of the relative normal velocities
     grains    (grains, 2)  mσγ̇   total impulse of each grain
     loaded    (grains,)    –     contacts with an impulse of each grain

@@ -54,7 +54,7 @@ class Tally:
     )
     impulse: Float[Array, "*b"] = _sum(CONTACT, "mσγ̇", "contact impulses p")
     binary_impulse: Float[Array, "*b"] = _sum(
-        CONTACT, "mσγ̇", "(1+α) μ₁₂ max(0, −u⁻), the impulses if every collision were binary"
+        CONTACT, "mσγ̇", "(1+α) m₁₂ max(0, −u⁻), the impulses if every collision were binary"
     )
     contact_moment: Float[Array, "*b 2 2"] = _sum(
         CONTACT, "mσ²γ̇", "σ ⊗ p n over the contacts, σ the centre-to-centre vector", _TENSOR
@@ -72,10 +72,10 @@ class Tally:
         FLIGHT, "mσ²γ̇", "∫ Σ m c ⊗ c dt, exact along the flights", _TENSOR
     )
     dissipation: Float[Array, "*b"] = _sum(
-        CONTACT, "mσ²γ̇²", "energy lost in contacts, −½ Σ p (u⁻ + u⁺)"
+        CONTACT, "mσ²γ̇²", "energy lost in contacts, −½ Σ J (u⁻ + u⁺)"
     )
     complementarity: Float[Array, "*b"] = _sum(
-        CONTACT, "mσ²γ̇²", "½ Σ p (u⁺ + α u⁻), zero where a solve is exact"
+        CONTACT, "mσ²γ̇²", "½ Σ J (u⁺ + α u⁻), zero where a solve is exact"
     )
     energy_change: Float[Array, "*b"] = _sum(
         AT_END, "mσ²γ̇²", "growth of the kinetic energy ½ Σ m c²"
@@ -101,7 +101,7 @@ class Tally:
     binary_dissipation: Float[Array, "*b"] = _sum(
         CONTACT,
         "mσ²γ̇²",
-        "½ (1−α²) μ₁₂ max(0, −u⁻)², the energy lost if every collision were binary",
+        "½ (1−α²) m₁₂ max(0, −u⁻)², the energy lost if every collision were binary",
     )
     largest_overlap: Float[Array, "*b"] = _sum(LARGEST, "σ", "overlap of a contact")
     worst_residual: Float[Array, "*b"] = _sum(LARGEST, "–", "relative residual of a solve")

@@ -207,7 +207,7 @@ class Observables:
         group="diagnostics",
     )
     complementarity_power = Observable(
-        "sum of p (u+ + alpha u-)/2, which an exact solve makes zero, over shear work",
+        "sum of J (u+ + alpha u-)/2, which an exact solve makes zero, over shear work",
         lambda s: s.ratio(s.tally.complementarity, s.xp.abs(s.work)),
         group="diagnostics",
     )

@@ -78,9 +78,9 @@ def enskog_collisions(
 
     Let n be the normal from grain i to grain j. The approach speed w = (v_i − v_j)·n is Gaussian,
     with mean −γ̇ d_ij n_x n_y and variance n·(T_i/m_i + T_j/m_j)·n; averages ⟨ ⟩ are over w > 0. A
-    collision transfers the impulse p = (1 + α) μ_ij w and loses the energy (1 − α) p w/2, so the
-    stress is ½ Σ_ij n_i n_j χ_ij d_ij² (1 + α) μ_ij ∮ dn n ⊗ n ⟨w²⟩ and the dissipation rate
-    ¼ Σ_ij n_i n_j χ_ij d_ij (1 − α²) μ_ij ∮ dn ⟨w³⟩. It adds −p n/m_i to v_i, so the temperature
+    collision transfers the impulse p = (1 + α) m_ij w and loses the energy (1 − α) p w/2, so the
+    stress is ½ Σ_ij n_i n_j χ_ij d_ij² (1 + α) m_ij ∮ dn n ⊗ n ⟨w²⟩ and the dissipation rate
+    ¼ Σ_ij n_i n_j χ_ij d_ij (1 − α²) m_ij ∮ dn ⟨w³⟩. It adds −p n/m_i to v_i, so the temperature
     tensor of class i changes at the rate Σ_j n_j χ_ij d_ij ∮ dn ⟨w [p² n n/m_i − p (n c_i + c_i
     n)]⟩, where ⟨w² c_i⟩ = 2⟨w⟩ T_i·n/m_i, because c_i and w are jointly Gaussian.
 
@@ -90,7 +90,7 @@ def enskog_collisions(
       rate: shear rate.
       mixture: the classes.
       length: collisions lose 1/length of the energy above. The rest is given back: to grain i the
-        share μ_ij/m_i, to both directions alike.
+        share m_ij/m_i, to both directions alike.
 
     Source: J. T. Jenkins and M. W. Richman, J. Fluid Mech. 192, 313 (1988).
     """
