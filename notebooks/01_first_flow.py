@@ -16,9 +16,8 @@
 # %% [markdown]
 # # What carries the stress of a sheared granular flow?
 #
-# Rigid discs that lose energy when they collide are sheared at a constant rate in a periodic cell.
-# This notebook packs them, shears them until they are steady, looks at the forces between them, and
-# explains the force ratio. `QUICK=1` in the environment makes everything smaller.
+# We shear rigid discs that lose energy when they collide, and look at the forces between them.
+# `QUICK=1` in the environment makes everything smaller.
 
 # %%
 import os
@@ -41,9 +40,9 @@ grains, strain = (64, 2.0) if quick else (256, 16.0)
 # %% [markdown]
 # ## A flow
 #
-# A flow is a few numbers. The restitution α is the normal velocity after a collision over that
-# before, the packing fraction ν the area of the grains over that of the cell. Lengths are in mean
-# diameters σ, masses in those of a mean grain, times in the inverse shear rate 1/γ̇.
+# The restitution α is the normal velocity after a collision over that before, the packing fraction
+# ν the area of the grains over that of the cell. Units are the mean diameter σ, the mass m of a
+# grain of that diameter, and the shear rate γ̇.
 
 # %%
 flow = jg.ShearFlow(grains=grains, restitution=0.3, packing_fraction=0.76, timestep=1e-3)
@@ -52,8 +51,8 @@ flow
 # %% [markdown]
 # ## From a packing to a steady flow
 #
-# `heated` packs the discs without overlap and gives them random velocities. The flow then forgets
-# this start: the shear heats the grains, their collisions cool them, and the two come into balance.
+# `heated` gives packed discs random velocities. Shear then heats the grains and collisions cool
+# them, until the two balance:
 
 # %%
 start = jg.heated(flow, jax.random.key(0), temperature=4.0)
@@ -70,9 +69,7 @@ axes[1].set(xlabel=r"strain $\dot\gamma t$", ylabel=r"pressure $p$ / $m\dot\gamm
 plt.show()
 
 # %% [markdown]
-# Temperature and pressure, each averaged over a strain of 0.1. They level off within a strain of
-# about one, and fluctuate as 256 grains do. `prepare` does all of this by itself: it packs, heats,
-# and shears until temperature and pressure have no drift left.
+# `prepare` does all of this, until neither temperature nor pressure drifts:
 
 # %%
 state = jg.prepare(flow, jax.random.key(0), equilibrate=2.0 if quick else None)
@@ -92,41 +89,39 @@ print("status:", jg.Status(int(sample.status)).name)
 # %% [markdown]
 # ## Contact forces
 #
-# A series of snapshots, one at each of twenty time steps. Lines join grains that push each other,
-# and their width is the mean force. Red pairs collide alone. Black ones belong to clusters of three
-# or more grains that push at once.
+# Over twenty time steps, lines join grains that push each other. Red pairs collide alone, black
+# ones are in clusters of three or more grains.
 
 # %%
 steps = 20
-state, seen = jg.snapshot_series(flow, state, strain=steps * flow.timestep, count=steps)
-jg.flow_figure(seen)
+state, snapshots = jg.snapshot_series(flow, state, strain=steps * flow.timestep, count=steps)
+jg.flow_figure(snapshots)
 
 # %% [markdown]
 # ## The force ratio
 #
-# Two grains that collide alone exchange the binary impulse (1 + α) m₁₂ u, with their reduced mass
-# m₁₂ and their speed of approach u. The force ratio is the sum of all contact impulses over the sum
-# of the binary impulses of the same contacts. Taken from the snapshots by hand, it is that of
-# `jg.sample` over the same steps:
+# The force ratio is the sum of all impulses J over the sum of the binary impulses, (1 + α)
+# m<sub>ij</sub> max(0, −u⁻), of the same contacts, with the reduced mass m<sub>ij</sub> and the
+# relative normal velocity u⁻ before the step (Lois, Lemaître and Carlson, *Momentum transport in
+# granular flows*). By hand and by `jg.sample`:
 
 # %%
 steps = 50 if quick else 500
 state, _ = jg.snapshot_series(flow, state, flow.timestep, 1)
-_, same = jg.sample(flow, state, steps * flow.timestep)
-_, seen = jg.snapshot_series(flow, state, steps * flow.timestep, steps)
-contacts, impulse = seen.contacts, np.asarray(seen.impulses)
+_, over_steps = jg.sample(flow, state, steps * flow.timestep)
+_, snapshots = jg.snapshot_series(flow, state, steps * flow.timestep, steps)
+contacts, impulse = snapshots.contacts, np.asarray(snapshots.impulses)
 reduced = 1 / np.where(contacts.used, contacts.inverse_mass_i + contacts.inverse_mass_j, np.inf)
 binary = (1 + flow.restitution) * reduced * np.maximum(0, -contacts.approach)
 print(f"N = {grains}, dt = {flow.timestep:g}, {steps} steps:", end=" ")
-print(f"{impulse.sum() / binary.sum():.4f} by hand, {same.force_ratio:.4f} by jg.sample")
+print(f"{impulse.sum() / binary.sum():.4f} by hand, {over_steps.force_ratio:.4f} by jg.sample")
 
 # %% [markdown]
-# Contact by contact, binary collisions lie on the diagonal. Contacts in clusters transmit what
-# their neighbours push, so most of them lie above. Some carry a force although their grains recede;
-# these are not drawn.
+# Binary collisions lie on the diagonal, most contacts in clusters above it. Receding contacts have
+# no binary impulse and are not drawn.
 
 # %%
-share = cluster_share(seen)
+share = cluster_share(snapshots)
 print(
     f"N = {grains}, dt = {flow.timestep:g}, {steps} time steps, ± one standard error; in clusters "
     "are"
@@ -136,7 +131,7 @@ print(
 )
 loaded = contacts.used & (impulse > 0)
 time, slot = np.nonzero(loaded)
-clustered = clusters(seen).sizes[time, contacts.i[time, slot]] > 2
+clustered = clusters(snapshots).sizes[time, contacts.i[time, slot]] > 2
 x, y = binary[loaded], impulse[loaded]
 
 # %%
@@ -148,7 +143,7 @@ for chosen, colour, label in (
     axes.loglog(x[chosen], y[chosen], ".", color=colour, ms=2, label=label)
 axes.set(
     xlabel=r"binary impulse / $m\sigma\dot\gamma$",
-    ylabel=r"impulse / $m\sigma\dot\gamma$",
+    ylabel=r"impulse $J$ / $m\sigma\dot\gamma$",
     aspect="equal",
 )
 axes.set(xlim=(1e-4, 10), ylim=(1e-4, 10))
@@ -156,11 +151,10 @@ axes.legend(frameon=False, markerscale=4)
 plt.show()
 
 # %% [markdown]
-# ## A force ratio belongs to its time step
+# ## The time step
 #
-# In a shorter time step fewer grains push at once: what was a cluster becomes a succession of
-# collisions of the same grains. So the force ratio falls, and the stress stays. A ratio above one
-# says that the collisions *of one time step* are not binary, and is a result only together with dt.
+# A force ratio means nothing without its time step. In a shorter one a cluster is a succession of
+# collisions of the same grains, so the force ratio falls while the stress stays.
 
 # %%
 flows = jg.ShearFlow(
@@ -173,11 +167,11 @@ _, samples = jg.sample(flows, states, strain)
 errors = samples.errors()
 
 for k, timestep in enumerate(flows.timestep):
-    found = [
+    texts = [
         with_error(samples.averages[name][k], errors[name][k])
         for name in ("force_ratio", "pressure")
     ]
-    print(f"N = {grains}, dt = {timestep:.0e}: force ratio {found[0]}, pressure {found[1]}")
+    print(f"N = {grains}, dt = {timestep:.0e}: force ratio {texts[0]}, pressure {texts[1]}")
 
 # %%
 figure, axes = plt.subplots(2, 1, figsize=(3.35, 3.2), sharex=True)
@@ -191,6 +185,6 @@ axes[1].set(xscale="log", xlabel=r"time step $\dot\gamma\,\mathrm{d}t$")
 plt.show()
 
 # %% [markdown]
-# **Contacts carry it: in nearly elastic flow one pair at a time, in dissipative flow clusters that
-# push at once.** The force ratio says how much more these push than the same pairs would alone. It
-# falls as the time step becomes shorter, and the pressure does not.
+# **Contacts carry it, and in dissipative flow clusters of grains that push at once carry much of
+# it.** The force ratio says how much more these push than the same pairs would alone, at the given
+# time step.

@@ -17,8 +17,8 @@
 # # Where are collisions binary, and how sure is that?
 #
 # A map of the force ratio over restitution α and packing fraction ν (Lois, Lemaître and Carlson,
-# *Momentum transport in granular flows*), the errors of its numbers, and beside it what
-# `jg.validity` knows without a simulation. `QUICK=1` in the environment makes everything smaller.
+# *Momentum transport in granular flows*) with its errors, beside `jg.validity`, which needs no
+# simulation. `QUICK=1` in the environment makes everything smaller.
 
 # %%
 import os
@@ -43,9 +43,8 @@ run = {"grains": 64, "seeds": 1} if quick else {"grains": 256, "seeds": 2}
 # %% [markdown]
 # ## The map
 #
-# Each point is a few independent flows, the seeds. Each is packed, sheared until it is steady, and
-# sampled over six correlation strains. A point where something went wrong keeps its value and has a
-# status.
+# A point is one or more flows (seeds), sheared until they are steady and sampled over six
+# correlation strains. If something goes wrong, it keeps its value and has a status.
 
 # %%
 data = jg.ratio_map(restitution, packing_fraction, timestep=timestep, **run)
@@ -57,15 +56,13 @@ print(
 xr.apply_ufunc(with_error, data.force_ratio, data.force_ratio_stderr, vectorize=True).to_pandas()
 
 # %% [markdown]
-# The force ratio (a) and the shear-stress ratio (b) with one standard error. Both belong to the
-# time step that the caption names.
+# The force ratio (a) and the shear-stress ratio (b):
 
 # %%
 jg.ratio_curves(data)
 
 # %% [markdown]
-# Contours of the excess, the force ratio less one. Above the lowest one the mean force exceeds that
-# of binary collisions by more than a twentieth, at this time step.
+# Contours of the force ratio less one:
 
 # %%
 jg.ratio_contours(data)
@@ -73,11 +70,9 @@ jg.ratio_contours(data)
 # %% [markdown]
 # ## The parts of the total error
 #
-# A standard error says how far another sample of the same flow may be off. A large system with
-# exact collisions has other averages: the map also has estimates of these, corrected for the number
-# of grains by a measured law, with the half-widths of 95 % intervals. Their parts come from
-# sampling, time step, correction and tolerance. A force ratio belongs to its time step, so it has
-# no error from dt. In per cent, at one point:
+# The standard error is that of sampling. The map also estimates averages of a large system with
+# exact collisions, with half-widths of 95 % intervals and their parts. The force ratio has no error
+# from dt, as it means nothing without its dt. In per cent, at one point:
 
 # %%
 names = ["force_ratio", "pressure", "shear_stress", "granular_temperature"]
@@ -94,31 +89,30 @@ xr.Dataset(
 ).to_dataframe()[names].round(2)
 
 # %% [markdown]
-# The largest part decides what to do about it: more strain or seeds for sampling, more grains for
-# size.
+# The largest part says what to do: more strain or seeds for sampling, more grains for the
+# correction.
 
 # %% [markdown]
 # ## Beside the reference map
 #
-# `jg.validity` reads a map of up to 6400 grains, dt = 1e-4, that was measured once, for a large
-# system. Its pressure should agree with that above within the combined intervals. Its force ratio
-# need not, since it belongs to another dt.
+# `jg.validity` reads a map of up to 6400 grains at dt = 1e-4, for a large system. Pressures should
+# agree within the combined intervals; force ratios need not, as dt differs.
 
 # %%
-alpha, nu = np.meshgrid(restitution, packing_fraction)
-known = jg.validity(alpha, nu)
+alphas, nus = np.meshgrid(restitution, packing_fraction)
+reference = jg.validity(alphas, nus)
 measured = data.pressure_large_system.values
 error = data.pressure_large_system_ci95.sel(error_source="total").values
-inside = abs(measured - known.measured["pressure"]) <= np.hypot(
-    error, known.measured_ci95["pressure"]
+inside = abs(measured - reference.measured["pressure"]) <= np.hypot(
+    error, reference.measured_ci95["pressure"]
 )
 print(f"pressure: {inside.sum()} of {inside.size} differences within the combined 95 % intervals")
 
 # %%
 figure, axes = plt.subplots(figsize=(3.35, 3.0))
 fine = np.linspace(min(packing_fraction), max(packing_fraction), 60)
-for k, one in enumerate(restitution):
-    line = jg.validity(one, fine)
+for k, alpha in enumerate(restitution):
+    line = jg.validity(alpha, fine)
     middle, half = line.measured["pressure"], line.measured_ci95["pressure"]
     shade = plt.cm.viridis(0.85 * k / (len(restitution) - 1))
     axes.fill_between(fine, middle - half, middle + half, color=shade, alpha=0.3, lw=0)
@@ -129,46 +123,49 @@ for k, one in enumerate(restitution):
         fmt="os^Dv"[k],
         ms=3.5,
         color=shade,
-        label=one,
+        label=alpha,
     )
 axes.set(yscale="log", xlabel=r"packing fraction $\nu$", ylabel=r"pressure $p$ / $m\dot\gamma^2$")
 axes.legend(title=r"restitution $\alpha$", title_fontsize=7, fontsize=7, frameon=False)
 plt.show()
 
 # %% [markdown]
-# Bands: the reference map, points: the map above, both with their 95 % intervals.
+# Bands: the reference map. Points: the map above.
 #
 # ## Does kinetic theory hold where collisions are binary?
 #
-# Not necessarily. A force ratio near one says that clusters carry little, not that velocities are
-# independent. The best of three theories, moments of an anisotropic Gaussian with Enskog's
-# collision rate, against the reference map:
+# Not necessarily: binary collisions need not be independent. The best of three theories, moments of
+# an anisotropic Gaussian (Jenkins and Richman 1988), against the reference map:
 
 # %%
-for one in [(0.9, 0.6), (0.8, 0.75), (0.5, 0.4), (0.2, 0.5)]:
-    print(f"α = {one[0]}, ν = {one[1]}: {jg.validity(*one).verdict()}\n")
+for alpha, nu in [(0.9, 0.6), (0.8, 0.75), (0.5, 0.4), (0.2, 0.5)]:
+    print(f"α = {alpha}, ν = {nu}: {jg.validity(alpha, nu).verdict()}\n")
 
 # %%
-off, interval, ratio = (
-    known.error["pressure"],
-    known.error_ci95["pressure"],
-    known.measured["force_ratio"],
+relative, interval, ratio = (
+    reference.error["pressure"],
+    reference.error_ci95["pressure"],
+    reference.measured["force_ratio"],
 )
 near = ratio < 1.05
 print(
     f"{near.sum()} of {near.size} points have a force ratio below 1.05 (dt = 1e-4); at",
     end=" ",
 )
-print(f"{(near & (abs(off) < 0.1)).sum()} of these the theory's pressure is within 10 %")
+print(f"{(near & (abs(relative) < 0.1)).sum()} of these the theory's pressure is within 10 %")
 
 # %%
 figure, axes = plt.subplots(figsize=(3.35, 3.0))
 axes.axhspan(-10, 10, color="0.9", zorder=0)
-for k, one in enumerate(restitution):
+for k, alpha in enumerate(restitution):
     shade = plt.cm.viridis(0.85 * k / (len(restitution) - 1))
     style = {"fmt": "os^Dv"[k] + "-", "ms": 4, "lw": 0.8, "color": shade, "mfc": "white"}
-    axes.errorbar(packing_fraction, 100 * off[:, k], 100 * interval[:, k], label=one, **style)
-    axes.plot(nu[near[:, k], k], 100 * off[near[:, k], k], "os^Dv"[k], ms=4, color=shade, zorder=4)
+    axes.errorbar(
+        packing_fraction, 100 * relative[:, k], 100 * interval[:, k], label=alpha, **style
+    )
+    axes.plot(
+        nus[near[:, k], k], 100 * relative[near[:, k], k], "os^Dv"[k], ms=4, color=shade, zorder=4
+    )
 axes.set(xlabel=r"packing fraction $\nu$", ylabel="theory's error of the pressure (%)")
 keys = {
     "title": r"restitution $\alpha$",
@@ -181,7 +178,8 @@ figure.legend(loc="outside upper center", ncols=len(restitution), handletextpad=
 plt.show()
 
 # %% [markdown]
-# Filled symbols: force ratio below 1.05. Grey: 10 %. Bars: 95 % intervals for a large system.
+# Filled: force ratio below 1.05. Grey: 10 %. Bars: 95 % intervals.
 #
-# **Collisions are binary in loose or nearly elastic flows; the intervals say how sure that is.**
-# The theory fails well below the lowest contour of the force ratio; the next notebook says why.
+# **Collisions are binary in loose or nearly elastic flows; every force ratio has a standard error,
+# every average of a large system a 95 % interval.** Kinetic theory fails well below the lowest
+# contour; the next notebook says why.

@@ -16,10 +16,9 @@
 # %% [markdown]
 # # Why does kinetic theory fail, and what mends it?
 #
-# Clusters are the obvious suspect. They carry the stress of dense, dissipative flows, but kinetic
-# theory fails long before that, where collisions are still binary. This notebook takes measured
-# stresses apart, factor by factor, and puts what it finds back into the theory. `QUICK=1` in the
-# environment makes everything smaller.
+# Clusters are the obvious suspect, but kinetic theory fails long before they carry the stress. We
+# take the measured stress apart, factor by factor, and put what we find back into the theory.
+# `QUICK=1` in the environment makes everything smaller.
 
 # %%
 import os
@@ -44,10 +43,10 @@ colours = plt.cm.viridis(np.linspace(0, 0.85, len(restitution)))
 # %% [markdown]
 # ## Five factors
 #
-# Enskog's contact pressure at the measured granular temperature, times five factors, is the
-# measured one. Each factor replaces one assumption by a measurement: the temperature relative to
-# the flow nearby (local temperature), its anisotropy, the speeds at which colliding grains approach
-# (chaos), the pairs at contact, and the impulses (binary).
+# The measured contact pressure is Enskog's, at the measured granular temperature, times five
+# factors. Each replaces an assumption by a measurement: the temperature relative to the flow nearby
+# (`local_temperature`), its `anisotropy`, the speeds at which colliding grains approach (`chaos`),
+# the `pairs` at contact, and the impulses (`binary`).
 
 # %%
 data = jg.ratio_map(restitution, packing_fraction, grains=grains, seeds=1, timestep=3e-4)
@@ -74,69 +73,20 @@ print(
 )
 
 # %% [markdown]
-# The product is an identity. Chaos and pairs compensate each other, so a theory may be right for
-# the wrong reasons. Over the plane, chaos fails first as grains become dissipative, and pairs as
-# flows become dense. The binary assumption fails last, where flows are both.
+# The product is an identity. Chaos fails first as grains become dissipative, and pairs as flows
+# become dense, and the two compensate each other. The binary assumption fails last. In a shorter
+# time step it fails less, and chaos and pairs more: a cluster is then a succession of collisions.
 
 # %%
 jg.enskog_factors(data)
 
 # %% [markdown]
-# ## What clusters become as dt → 0
-#
-# The binary factor belongs to its time step. In a shorter one a cluster is a succession of
-# collisions of the same grains: more pairs that approach more slowly, and the product stays. At α =
-# 0.2 "clusters" and "correlated collisions" are therefore two names for the same thing. At α = 0.5
-# the binary factor goes to one, while chaos and pairs keep their values.
-
-# %%
-timesteps = [1e-3, 3e-4] if quick else [1e-3, 1e-4, 3e-5]
-size = min(grains, 256)
-fine = jg.ratio_map(
-    [0.2, 0.5], [0.6, 0.65], timestep=timesteps, grains=size, seeds=1 if quick else 2
-)
-below = fine["theory/enskog_pressure"]
-xx, yy = (fine["stresses/contact_stress"].isel(axis_a=k, axis_b=k) for k in (0, 1))
-errors = [fine["stresses/contact_stress_stderr"].isel(axis_a=k, axis_b=k) for k in (0, 1)]
-ratio = (xx + yy) / 2 / below
-stderr = ratio * np.hypot(
-    sum(errors) / (xx + yy), fine["theory/enskog_pressure_stderr"] / below
-)  # as if independent
-for alpha in (0.2, 0.5):
-    for timestep in timesteps:
-        one = {"restitution": alpha, "packing_fraction": 0.6, "timestep": timestep}
-        parts = [
-            f"{x} {text(fine.sel(one), f'theory/enskog_factor_pressure_{x}')}" for x in names[2:]
-        ]
-        total = f"product {with_error(float(ratio.sel(one)), float(stderr.sel(one)))}"
-        print(f"α = {alpha}, ν = 0.6, N = {size}, dt = {timestep:.0e}: {', '.join(parts)}, {total}")
-
-# %% [markdown]
-# ## Which temperature
-#
-# Long waves of velocity carry energy that no collision feels. They grow with the cell, so the
-# granular temperature depends on N. The local temperature, relative to boxes of about 25 grains,
-# has a limit.
-
-# %%
-sizes = [64, 144] if quick else [100, 400, 1600]
-grown = jg.ratio_map([0.5], [0.6], grains=sizes, timestep=1e-3, seeds=1).isel(
-    packing_fraction=0, restitution=0
-)
-for n in sizes:
-    both = [
-        text(grown.sel(grains=n), name)
-        for name in ("granular_temperature", "local_granular_temperature")
-    ]
-    print(f"α = 0.5, ν = 0.6, N = {n}, dt = 1e-3: T = {both[0]}, local T = {both[1]} mσ²γ̇²")
-
-# %% [markdown]
 # ## The correlation length
 #
-# Grains that approach more slowly lose less energy than the stress suggests, since energy goes with
-# the cube of their speed and the stress with its square. Extended kinetic theory has a length for
-# this: L′ is Enskog's dissipation rate over its pressure, divided by the same quotient of the
-# measured ones. Where collisions are binary, L′ is chaos^(−1/2).
+# The dissipation rate goes with the cube of the speed of approach, the stress with its square. In
+# extended kinetic theory (Jenkins 2006) a length L accounts for the loss of dissipation. L′ is
+# Enskog's dissipation rate over his pressure, divided by the measured quotient; where collisions
+# are binary it is chaos^(−1/2).
 
 # %%
 length, error = (
@@ -172,15 +122,14 @@ axes.legend(title=r"restitution $\alpha$", title_fontsize=7, fontsize=7, frameon
 plt.show()
 
 # %% [markdown]
-# Lines: the law of L′ in α and ν that was fitted to the reference map (dt = 1e-4). Bars: one
-# standard error.
+# Lines: a law of α and ν fitted to the reference map (dt = 1e-4).
 #
-# ## The theory, mended
+# ## The theory, corrected
 #
-# The error of the theory's stress is mainly one of its temperature: with too much dissipation the
-# flow is too cold. `corrected_shear` divides the dissipation by L′, multiplies the pairs at contact
-# by a measured factor, and solves the balance of the moments as before. It needs α and ν only;
-# nothing is adjusted to T, p or τ.
+# With too much dissipation the flow of the theory is too cold, which is most of its error in the
+# stress. `corrected_shear` divides the dissipation by L′, multiplies the pairs at contact by a
+# measured factor, and solves the balance of the moments as before. Nothing is adjusted to T, p or
+# τ.
 
 # %%
 alphas, nus = np.meshgrid(restitution, packing_fraction)
@@ -192,14 +141,14 @@ pairs = {
 }
 figure, panels = plt.subplots(1, 3, figsize=(6.7, 2.7))
 print(f"N = {grains}, dt = 3e-4, {alphas.size} points, rms of ln(predicted/measured):")
-for axes, (name, (own, label)) in zip(panels, pairs.items(), strict=True):
-    measured, error = data[own].values.ravel(), data[f"{own}_stderr"].values.ravel()
-    moments, mended = data[f"theory/{name}"].values.ravel(), np.asarray(getattr(corrected, name))
+for axes, (name, (column, label)) in zip(panels, pairs.items(), strict=True):
+    measured, error = data[column].values.ravel(), data[f"{column}_stderr"].values.ravel()
+    moments, from_laws = data[f"theory/{name}"].values.ravel(), np.asarray(getattr(corrected, name))
     bars = np.asarray(getattr(corrected, f"{name}_stderr"))
-    before, after = (np.sqrt(np.mean(np.log(x / measured) ** 2)) for x in (moments, mended))
+    before, after = (np.sqrt(np.mean(np.log(x / measured) ** 2)) for x in (moments, from_laws))
     noise = np.sqrt(np.mean((error / measured) ** 2))
     print(
-        f"{own:27s} moments {before:.2f}, corrected {after:.2f}, standard error of the measured "
+        f"{column:27s} moments {before:.2f}, corrected {after:.2f}, standard error of the measured "
         f"ones {noise:.2f}"
     )
     axes.errorbar(
@@ -213,7 +162,7 @@ for axes, (name, (own, label)) in zip(panels, pairs.items(), strict=True):
         lw=0.8,
         label="moments",
     )
-    axes.errorbar(measured, mended, bars, error, fmt="ko", ms=3, lw=0.8, label="corrected")
+    axes.errorbar(measured, from_laws, bars, error, fmt="ko", ms=3, lw=0.8, label="corrected")
     axes.axline((1, 1), (2, 2), color="0.4", lw=0.8)
     axes.set(xscale="log", yscale="log", title=label)
     axes.title.set_size(8)
@@ -223,9 +172,8 @@ panels[0].legend(fontsize=7, frameon=False)
 plt.show()
 
 # %% [markdown]
-# Bars: the scatter of the laws in other flows that were not fitted, and one standard error of what
-# was measured. The rightmost point is nearly elastic and dense.
+# Vertical bars: the scatter of the laws in flows that were not fitted.
 #
-# **Kinetic theory fails because grains that collide approach more slowly than independent ones, and
-# because more pairs are at contact than in equilibrium.** A law of each, of α and ν alone, mends
+# **Kinetic theory fails because colliding grains approach more slowly than independent ones, and
+# because more pairs are at contact than in equilibrium.** A law of each, of α and ν alone, corrects
 # most of it, but not nearly elastic, dense flow, which is more viscous than in Enskog's theory.

@@ -16,9 +16,8 @@
 # %% [markdown]
 # # What is a derivative of a flow good for?
 #
-# A derivative of a flow with respect to its restitution α is checked against finite differences,
-# and then finds α from what was seen of a flow, over as long a strain as collisions allow.
-# `QUICK=1` in the environment makes everything smaller.
+# The derivative of a flow with respect to its restitution α is checked against finite differences,
+# and then finds α from observations. `QUICK=1` in the environment makes everything smaller.
 
 # %%
 import os
@@ -40,10 +39,8 @@ quick = bool(os.environ.get("QUICK"))
 # %% [markdown]
 # ## A derivative, checked
 #
-# `jg.advance` is differentiable: the contact solve by the implicit function theorem, the flight
-# directly. Reverse mode needs the number of steps with contacts, `events`, in advance. Here the
-# derivative of the kinetic energy after 50 steps with respect to α stands beside central
-# differences.
+# `jg.advance` is differentiable. Reverse mode needs the number of steps with contacts, `events`, in
+# advance. The derivative of the kinetic energy after 50 steps, beside central differences:
 
 # %%
 solver = jg.BarzilaiBorwein(tolerance=1e-10)
@@ -81,13 +78,12 @@ axes.set(
 plt.show()
 
 # %% [markdown]
-# Left, rounding and the tolerance of the solver over h; right, the truncation of the difference.
+# Left: rounding and the tolerance of the solver. Right: the truncation of the difference.
 #
-# ## A derivative, put to use
+# ## A derivative, used
 #
-# What is the restitution of grains that were seen twice? Short windows of a flow are observed at
-# their start, and at their end with noise of a thousandth of a diameter in positions.
-# `jg.fit_trajectory` minimises the misfit by optax, through the simulator in reverse mode.
+# What is the restitution of grains that were observed twice, the second time with noise?
+# `jg.fit_trajectory` minimises the misfit by optax, in reverse mode.
 
 # %%
 truth, guess, windows, dt = 0.73, 0.5, (3 if quick else 6), 1e-5
@@ -108,9 +104,9 @@ def fitted(strain):
         noisy(end.positions, position_noise, 1),
         noisy(end.velocities, velocity_noise, 2),
     )
-    seen = replace(end, positions=positions, velocities=velocities)
+    observed = replace(end, positions=positions, velocities=velocities)
     return jg.fit_trajectory(
-        replace(flow, restitution=guess), starts, seen, steps, position_noise, velocity_noise
+        replace(flow, restitution=guess), starts, observed, steps, position_noise, velocity_noise
     )
 
 
@@ -122,8 +118,8 @@ for strain in (0.02, 0.05, 1.0) if quick else (0.02, 0.05, 0.1, 0.2, 0.4, 1.0):
             f"strain {strain}: α = {with_error(fits[strain].restitution, fits[strain].stderr)}, "
             f"made with {truth}"
         )
-    except jg.InputError as refused:
-        print(f"strain {strain}: refused, {refused}")
+    except jg.InputError as error:
+        print(f"strain {strain}: refused, {error}")
 
 # %%
 figure, axes = plt.subplots(1, 2, figsize=(6.7, 2.4))
@@ -138,8 +134,8 @@ axes[1].set(xscale="log", xlabel="strain of a window", ylabel=r"restitution $\al
 plt.show()
 
 # %% [markdown]
-# Red: the α that the data were made with. **A derivative fits a parameter to what was seen, up to a
-# horizon.** The error bar shrinks with the strain, as derivatives grow exponentially: colliding
-# discs are chaotic. Where a change of α leads to other collisions, at an rms of ∂(position)/∂α of
-# one diameter, differentiation stops to be useful, and the fit refuses the windows. Before that, a
-# fit that ends in a minimum with other collisions is refused by its misfit.
+# Red: the true α.
+#
+# **A derivative fits a parameter to observations, up to a horizon.** Colliding discs are chaotic,
+# so derivatives grow exponentially with the strain, and error bars shrink. Where a change of α
+# leads to other collisions a derivative is of no use, and the fit refuses.
