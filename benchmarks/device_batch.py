@@ -50,9 +50,8 @@ def run(output: Output, paper: bool = False) -> None:
         for alpha, nu in points:
             rows.append(compare(alpha, nu, dt, replicas))
             print(
-                "{dt:7.0e}{alpha:6.2g}{nu:6.2g}{taken:23.3g}{plain:11.3g}{rival:17.3g}{ratio:14.1f}".format(
-                    **rows[-1]
-                )
+                "{dt:7.0e}{alpha:6.2g}{nu:6.2g}{taken:23.3g}{plain:11.3g}{rival:17.3g}"
+                "{ratio:14.1f}".format(**rows[-1])
             )
     result = {
         "hardware": output.hardware | {"device": device.device_kind, "devices": jax.device_count()},

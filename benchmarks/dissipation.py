@@ -108,9 +108,8 @@ def run(output: Output) -> None:
         print(
             "{nu:5.2f}{alpha:6.2f}{dissipation:8.3f} ± "
             "{dissipation_error:.3f}{length_from_pressure:9.3f} ± "
-            "{length_from_pressure_error:.3f}{times_root_chaos:9.3f}{binary:9.3f}{chaos:8.3f}".format(
-                **one
-            )
+            "{length_from_pressure_error:.3f}{times_root_chaos:9.3f}{binary:9.3f}"
+            "{chaos:8.3f}".format(**one)
         )
     heads = {
         name: {"points": some["nu"].size, "timestep": float(one.attrs["timestep"])} | sizes_of(one)

@@ -100,7 +100,8 @@ def default_device() -> Any:
     """The device that JAX computes on by default."""
     import jax
 
-    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]  # set by ``jax.default_device``
+    # set by ``jax.default_device``
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     return jax.devices(device)[0] if device is None or isinstance(device, str) else device
 
 

@@ -14,7 +14,7 @@
 # ---
 
 # %% [markdown]
-# # Why does kinetic theory fail, and what mends it?
+# # Why does kinetic theory fail, and what corrects it?
 #
 # Clusters are the obvious suspect, but kinetic theory fails long before they carry the stress. We
 # take the measured stress apart, factor by factor, and put what we find back into the theory.

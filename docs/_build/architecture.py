@@ -40,7 +40,9 @@ def imports() -> Counter[tuple[str, str]]:
     for path in sorted(PACKAGE.rglob("*.py")):
         importer = path.relative_to(PACKAGE).with_suffix("").parts[0]
         if not importer.startswith("__"):
-            found.update((importer, imported) for imported in _imported(path) if imported != importer)
+            found.update(
+                (importer, imported) for imported in _imported(path) if imported != importer
+            )
     return found
 
 
@@ -53,7 +55,11 @@ def _imported(path: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
             names.update(f"{node.module}.{alias.name}" for alias in node.names)
     parts = [name.split(".") for name in names if name.startswith("jaxgran.")]
-    return {part[1] for part in parts if (PACKAGE / part[1]).is_dir() or (PACKAGE / f"{part[1]}.py").is_file()}
+    return {
+        part[1]
+        for part in parts
+        if (PACKAGE / part[1]).is_dir() or (PACKAGE / f"{part[1]}.py").is_file()
+    }
 
 
 def drawing() -> Figure:
@@ -62,8 +68,9 @@ def drawing() -> Figure:
     place = {name: k for k, name in enumerate(name for row in ordered for name in row)}
     unknown = sorted({name for arrow in arrows for name in arrow} - set(place))
     if unknown:
-        raise ValueError("the contract of the imports in pyproject.toml names no row for "
-                         f"{', '.join(unknown)}.")
+        raise ValueError(
+            f"the contract of the imports in pyproject.toml names no row for {', '.join(unknown)}."
+        )
     upward = [f"{upper} → {lower}" for upper, lower in arrows if place[upper] > place[lower]]
     if upward:
         raise ValueError(f"these imports go up, and cannot be drawn: {', '.join(upward)}.")
@@ -77,7 +84,11 @@ def drawing() -> Figure:
         first += len(row)
     for name, k in place.items():
         _draw_box(axes, name, k)
-        _draw_imports(axes, k, {place[lower]: number for (upper, lower), number in arrows.items() if upper == name})
+        _draw_imports(
+            axes,
+            k,
+            {place[lower]: number for (upper, lower), number in arrows.items() if upper == name},
+        )
     axes.set_xlim(-0.5, count - 0.5)
     axes.set_ylim(-(count - 0.5) * _BAND, 0.5 * _BAND)
     axes.set_axis_off()
@@ -86,30 +97,44 @@ def drawing() -> Figure:
 
 def _draw_box(axes: Axes, name: str, k: int) -> None:
     corner = (k - _WIDTH / 2, -k * _BAND - _HEIGHT / 2)
-    axes.add_patch(FancyBboxPatch(corner, _WIDTH, _HEIGHT, "round,pad=0,rounding_size=0.08", fc="white", ec="black"))
+    axes.add_patch(
+        FancyBboxPatch(
+            corner, _WIDTH, _HEIGHT, "round,pad=0,rounding_size=0.08", fc="white", ec="black"
+        )
+    )
     axes.text(k, -k * _BAND, name, ha="center", va="center", fontsize=7.5)
 
 
 def _draw_imports(axes: Axes, k: int, imported: dict[int, int]) -> None:
-    """A line from the box to the right, and an arrow down from it into each box that is imported.
-    """
+    """A line from the box to the right, and an arrow down into each box that is imported."""
     if not imported:
         return
     y = -k * _BAND
     axes.plot([k + _WIDTH / 2, max(imported)], [y, y], color=_LINE, lw=0.8, zorder=1)
     for lower, number in imported.items():
         tip = -lower * _BAND + _HEIGHT / 2
-        arrow = {"arrowstyle": "-|>", "color": _LINE, "lw": 0.8, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8}
+        arrow = {
+            "arrowstyle": "-|>",
+            "color": _LINE,
+            "lw": 0.8,
+            "shrinkA": 0,
+            "shrinkB": 0,
+            "mutation_scale": 8,
+        }
         axes.annotate("", (lower, tip), (lower, y), arrowprops=arrow, zorder=1)
         circle = {"boxstyle": "circle,pad=0.25", "fc": "white", "ec": _LINE, "lw": 0.6}
-        axes.text(lower, y, str(number), ha="center", va="center", fontsize=_NUMBER, bbox=circle, zorder=3)
+        axes.text(
+            lower, y, str(number), ha="center", va="center", fontsize=_NUMBER, bbox=circle, zorder=3
+        )
 
 
 def picture(suffix: str = "svg") -> bytes:
     """The drawing as the content of a file; the same code gives the same bytes."""
     content = BytesIO()
     with rc_context({"svg.hashsalt": "architecture"}):
-        drawing().savefig(content, format=suffix, dpi=200, metadata={"Date": None} if suffix == "svg" else None)
+        drawing().savefig(
+            content, format=suffix, dpi=200, metadata={"Date": None} if suffix == "svg" else None
+        )
     return content.getvalue()
 
 

@@ -34,7 +34,7 @@ def executed(markdown: str, name: str) -> tuple[str, dict[str, bytes]]:
 
     def with_output(block: re.Match[str]) -> str:
         language, code = block.groups()
-        text, figure = (_python(code, names) if language == "python" else (_shell(code), None))
+        text, figure = _python(code, names) if language == "python" else (_shell(code), None)
         shown = [block[0]]
         if text:
             shown.append(f"```text\n{text.rstrip()}\n```")
@@ -70,6 +70,11 @@ def _shell(code: str) -> str:
     printed = []
     for words in map(shlex.split, code.replace("\\\n", " ").splitlines()):
         command = [sys.executable, "-m", *words]
-        done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-        printed += [textwrap.fill(line, 80) if line[:1].isalpha() else line.rstrip() for line in done.stdout.splitlines()]
+        done = subprocess.run(
+            command, env=environment, stdout=subprocess.PIPE, text=True, check=True
+        )
+        printed += [
+            textwrap.fill(line, 80) if line[:1].isalpha() else line.rstrip()
+            for line in done.stdout.splitlines()
+        ]
     return "\n".join(printed)

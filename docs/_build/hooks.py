@@ -14,12 +14,12 @@ from pathlib import Path
 
 import architecture
 import executed
-import notebooks
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+import notebooks
 from jaxgran.maps.results import open_map
 from jaxgran.page.explore import explore
 
@@ -30,7 +30,11 @@ LINKED_NOTEBOOK = re.compile(r"(?:\.\./)+notebooks/(\w+)\.ipynb")
 LINKED_PAGE = re.compile(r"(?:\.\./)+(CONTRIBUTING|CHANGELOG|SECURITY)\.md")
 CHART = re.compile(r'(<img [^>]*src="([^"]*charts/[^"]+\.(?:png|gif))"[^>]*>)')
 MATHEMATICS = re.compile(r"^\$\$(.+)\$\$$", re.MULTILINE)
-PAGES = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md", "security.md": "SECURITY.md"}
+PAGES = {
+    "contributing.md": "CONTRIBUTING.md",
+    "changelog.md": "CHANGELOG.md",
+    "security.md": "SECURITY.md",
+}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -38,7 +42,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for chart in sorted([*CHARTS.glob("*.png"), *CHARTS.glob("*.gif")]):
         files.append(File.generated(config, f"charts/{chart.name}", abs_src_path=str(chart)))
     files.append(File.generated(config, "charts/architecture.svg", content=architecture.picture()))
-    files.append(File.generated(config, "charts/paper.html", content=explore(open_map(CHARTS / "paper.nc")).text))
+    files.append(
+        File.generated(
+            config, "charts/paper.html", content=explore(open_map(CHARTS / "paper.nc")).text
+        )
+    )
     for name in notebooks.NAMES:
         markdown, beside = notebooks.shown(name)
         files.append(File.generated(config, f"notebooks/{name}.md", content=markdown))
@@ -50,7 +58,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Run the examples, turn links into the repository to those of the site, and typeset formulas."""
+    """Run the examples, make links into the repository those of the site, and typeset formulas."""
     name = page.file.src_uri
     if name in executed.PAGES:
         markdown, pictures = executed.executed(markdown, name.removesuffix(".md"))

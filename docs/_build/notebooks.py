@@ -65,8 +65,9 @@ def _output(output: dict[str, Any], name: str, files: dict[str, bytes]) -> str:
         if len(html) <= LONGEST:
             return f'<div class="output">{html}</div>'
         files[f"{name}.html"] = html.encode()
-        return ('<iframe class="page" title="What the cell above shows" '
-               f'src="../{name}.html"></iframe>')
+        return (
+            f'<iframe class="page" title="What the cell above shows" src="../{name}.html"></iframe>'
+        )
     return _text(data.get("text/plain", ""))
 
 

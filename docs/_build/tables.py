@@ -22,7 +22,9 @@ class Tables(griffe.Extension):
 
     def on_instance(self, *, obj: griffe.Object, **kwargs: Any) -> None:
         if obj.docstring is not None:
-            obj.docstring.value = in_markdown(obj.docstring.value.replace("{PARAMETERS}", parameters()))
+            obj.docstring.value = in_markdown(
+                obj.docstring.value.replace("{PARAMETERS}", parameters())
+            )
 
 
 def in_markdown(docstring: str) -> str:
@@ -56,10 +58,16 @@ def table(border: str, head: list[str], body: list[str]) -> list[str]:
     for line in filter(str.strip, body):
         row = cells(line)
         if rows and not row[0]:
-            rows[-1] = [f"{above} {more}".strip() for above, more in zip(rows[-1], row, strict=True)]
+            rows[-1] = [
+                f"{above} {more}".strip() for above, more in zip(rows[-1], row, strict=True)
+            ]
         else:
             rows.append(row)
-    titles = [" ".join(words).strip() for words in zip(*map(cells, head), strict=True)] if head else [""] * len(spans)
+    titles = (
+        [" ".join(words).strip() for words in zip(*map(cells, head), strict=True)]
+        if head
+        else [""] * len(spans)
+    )
     return [_row(titles), _row(["---"] * len(spans)), *map(_row, rows)]
 
 

@@ -154,5 +154,6 @@ def _cell_list(fractional: Array, cells_per_side: int, cell_capacity: int):
             warnings.simplefilter("ignore")
             from jax_md import partition
         smallest = 1 / (cells_per_side + 0.5)  # jax-md rounds the number of cells down
-        binning = partition.cell_list(1.0, smallest)  # pyright: ignore[reportArgumentType]  # a number will do
+        # a number will do for the box
+        binning = partition.cell_list(1.0, smallest)  # pyright: ignore[reportArgumentType]
         return binning.update(fractional, cell_capacity)
