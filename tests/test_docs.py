@@ -75,7 +75,7 @@ PLACEHOLDERS = (
     "ADDRESS COMMAND DT FACTOR FILE FOLDER LIST NAME NUMBER PRESET RULE STRAIN STRESS TAU TOL"
 )
 COMMANDS = (
-    "pip uv ruff pytest mkdocs chromium-driver sp-repo-review cut fix pair_style damping flip"
+    "pip uv ruff pytest mkdocs jupytext chromium-driver sp-repo-review cut fix pair_style damping flip"
 )
 FOLDERS = ("", "jaxgran", "tests", "benchmarks", "docs", "notebooks", "benchmarks/results")
 _FIELDS = (
