@@ -20,7 +20,6 @@ from functools import cache
 from typing import Any
 
 import jinja2
-import numpy as np
 
 from benchmarks import page_tables
 from benchmarks.output import RESULTS, ROOT
@@ -64,18 +63,6 @@ def at(rows: Iterable[Mapping[str, Any]], **conditions: Any) -> Mapping[str, Any
     """
     (row,) = (row for row in rows if all(row[name] == value for name, value in conditions.items()))
     return row
-
-
-def found(rows: Iterable[Mapping[str, Any]], **conditions: Any) -> Mapping[str, Any] | None:
-    """The first row with these values, None if there is none."""
-    return next(
-        (row for row in rows if all(row[name] == value for name, value in conditions.items())), None
-    )
-
-
-def flows_of(rows: Iterable[Mapping[str, Any]]) -> list[tuple[float, float]]:
-    """The pairs of restitution and packing fraction of some rows, each once."""
-    return list(dict.fromkeys((row["restitution"], row["packing_fraction"]) for row in rows))
 
 
 def sig(value: float, digits: int = 2) -> str:
@@ -175,16 +162,6 @@ def percent_pm(value_and_error: Iterable[float]) -> str:
     return pm(*(100 * x for x in value_and_error)) + " %"
 
 
-def signed(value: float, places: int = 1) -> str:
-    """A number with its sign.
-
-    Examples:
-      >>> signed(-0.42), signed(3.0, 0)
-      ('−0.4', '+3')
-    """
-    return f"{value:+.{places}f}".replace("-", "−")
-
-
 def over(one: Sequence[float], other: Sequence[float]) -> tuple[float, float]:
     """By how much a value exceeds another, relative to the other, and its standard error; both with
     their errors.
@@ -195,11 +172,6 @@ def over(one: Sequence[float], other: Sequence[float]) -> tuple[float, float]:
     """
     quotient = one[0] / other[0]
     return quotient - 1, quotient * math.hypot(one[1] / one[0], other[1] / other[0])
-
-
-def rms(values: Sequence[float]) -> float:
-    """Root mean square."""
-    return math.sqrt(sum(value**2 for value in values) / len(values))
 
 
 def product_of(
@@ -236,15 +208,6 @@ def lammps_ratio(flow: Mapping[str, Any]) -> str:
     return front.ratio(flow, "LAMMPS")
 
 
-def wave_exponent(row: Mapping[str, Any]) -> float:
-    """Exponent of the energy of waves across k, between wave numbers of 0.08 and 0.6/σ, in a row of
-    ``size_study``.
-    """
-    number, energy = (np.array(row["spectrum"][name]) for name in ("wave_number", "transverse"))
-    inside = (number > 0.08) & (number < 0.6)
-    return float(np.polyfit(np.log(number[inside]), np.log(energy[inside]), 1)[0])
-
-
 def output_of_where(restitution: float, packing_fraction: float) -> str:
     """The verdict and the averages that ``jaxgran where`` prints."""
     command = f"where --restitution {restitution} --packing-fraction {packing_fraction}"
@@ -276,14 +239,13 @@ ENVIRONMENT.filters |= {
 }
 ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table, "SOLVER_GROUPS": GROUPS}
 for _functions in (
-    (abs, max, at, found, flows_of, point, quotients, over, rms, ranked),
-    (sig, percent, percent_pm, pm, duration, signed),
+    (max, at, point, quotients, over, ranked),
+    (sig, percent, percent_pm, pm, duration),
     (grains_for, shear_stress_ratio_at),
     (
         lammps_ratio,
         output_of_where,
         product_of,
-        wave_exponent,
     ),
 ):
     ENVIRONMENT.globals |= {one.__name__: one for one in _functions}
