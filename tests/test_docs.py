@@ -74,9 +74,8 @@ FOREIGN = """ConstantMomentum NO_MKDOCS_2_WARNING as cell_size_too_small css csv
 PLACEHOLDERS = (
     "ADDRESS COMMAND DT FACTOR FILE FOLDER LIST NAME NUMBER PRESET RULE STRAIN STRESS TAU TOL"
 )
-COMMANDS = (
-    "pip uv ruff pytest mkdocs chromium-driver sp-repo-review cut fix pair_style damping flip"
-)
+COMMANDS = """pip uv ruff pytest mkdocs jupytext chromium-driver sp-repo-review
+    cut fix pair_style damping flip"""
 FOLDERS = ("", "jaxgran", "tests", "benchmarks", "docs", "notebooks", "benchmarks/results")
 _FIELDS = (
     "id",
