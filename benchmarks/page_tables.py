@@ -37,7 +37,7 @@ def variables(group: str) -> str:
         family = (
             "_large_system" in name
             or name.startswith("enskog_factor_")
-            or row.meaning.startswith("kinetic theory's prediction")
+            or (group == "theory" and name in OBSERVABLES)
         )
         if row.group == group and not family:
             measured = path_of(name) == row.path and name in OBSERVABLES

@@ -238,17 +238,14 @@ ENVIRONMENT.filters |= {
     "date": lambda number: f"{number // 10000}-{number // 100 % 100:02d}-{number % 100:02d}",
 }
 ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table, "SOLVER_GROUPS": GROUPS}
-for _functions in (
-    (max, at, point, quotients, over, ranked),
-    (sig, percent, percent_pm, pm, duration),
-    (grains_for, shear_stress_ratio_at),
-    (
-        lammps_ratio,
-        output_of_where,
-        product_of,
-    ),
-):
-    ENVIRONMENT.globals |= {one.__name__: one for one in _functions}
+ENVIRONMENT.globals |= {
+    one.__name__: one
+    for one in (
+        *(max, at, point, quotients, over, ranked),
+        *(sig, percent, percent_pm, pm, duration),
+        *(grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where, product_of),
+    )
+}
 ENVIRONMENT.globals |= {
     name: getattr(page_tables, name)
     for name in (

@@ -40,29 +40,26 @@ QUICK_LARGE = {"grains": 400, "timestep": 1e-3, "equilibrate": 1.0, "strain": 8.
 
 
 def run(output: Output, part: str = "random") -> None:
-    """Run the flows of a part, print each, and write them as JSON; large flows as they end."""
+    """Run the flows of a part, print each, and write them as JSON as they end."""
     start = time.perf_counter()
-    large = part == "large"
-    plan = {True: (LARGE, QUICK_LARGE), False: (FULL, QUICK)}[large][output.quick]
-    name = "reference_runs_large" if large else "reference_runs"
-    rows: list[dict] = []
-    for row in large_rows(plan) if large else fresh_rows(**plan):
+    name, full, quick, rows_of = PARTS[part]
+    plan, rows = quick if output.quick else full, []
+    for row in rows_of(**plan):
         rows.append(row)
-        seconds = time.perf_counter() - start
-        print(f"{len(rows)}: {row}, {seconds:.0f} s", flush=True)
-        if large or len(rows) == plan["points"]:
-            head = {**plan, "first_seed": FIRST_SEED, "seconds": round(seconds)}
-            output.write_rows(name, head, "rows", rows)
+        seconds = round(time.perf_counter() - start)
+        print(f"{len(rows)}: {row}, {seconds} s", flush=True)
+        head = {**plan, "first_seed": FIRST_SEED, "seconds": seconds}
+        output.write_rows(name, head, "rows", rows)
 
 
-def large_rows(plan: dict) -> Iterator[dict]:
+def large_rows(**plan: float) -> Iterator[dict]:
     """Averages of the large flows on all cores, in the order in which they end."""
     with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
         for future in as_completed(pool.submit(large_row, plan, flow) for flow in LARGE_FLOWS):
             yield future.result()
 
 
-def large_row(plan: dict, flow: tuple[float, float]) -> dict:
+def large_row(plan: dict[str, float], flow: tuple[float, float]) -> dict:
     """Averages of a large flow."""
     one = {"restitution": flow[0], "packing_fraction": flow[1], "grains": plan["grains"]}
     begin = time.process_time()
@@ -108,3 +105,9 @@ def _row(data: xr.DataTree) -> dict[str, float]:
 
 def _short(value: xr.DataArray) -> float:
     return float(f"{value.item():.6g}")
+
+
+PARTS = {
+    "random": ("reference_runs", FULL, QUICK, fresh_rows),
+    "large": ("reference_runs_large", LARGE, QUICK_LARGE, large_rows),
+}

@@ -37,13 +37,13 @@ import jaxgran as jg
 from benchmarks.output import Output
 from benchmarks.peers import event_driven, lammps
 from benchmarks.peers.jaxgran_itself import discs_of
-from benchmarks.peers.problem import Flow, Run
+from benchmarks.peers.problem import Flow, Stress, blocks_of, relative
+from benchmarks.peers.problem import averages as stress_means
 from jaxgran.contact.delassus import diagonal
 from jaxgran.environment import usable_cores
 from jaxgran.model.status import DEEP_OVERLAP
 from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, empty_figure, styled
 from jaxgran.sampling.averages import averages
-from jaxgran.statistics import jackknife
 
 JAMMED = 0.84
 FLOWS = (
@@ -52,11 +52,10 @@ FLOWS = (
 )
 TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4)
 STIFFNESSES = (1e3, 1e4, 1e5, 1e6, 1e7)
+SOFT = "soft discs, LAMMPS"
 RIGHT = 0.05  # relative error of pressure and shear stress, and a standard error
 STRESSES = ("pressure", "shear_stress")
-SLOW = (
-    5e-3  # s of processor time for a grain and a unit of strain; the default takes 0.15 ms at most
-)
+SLOW = 5e-3  # s of processor time for a grain and a unit of strain; the default takes 0.15 ms
 GAIN = {"float64": 1e-6, "float32": 1e-3}  # of the energies exchanged, which rounding explains
 OUTCOMES = {  # mildest first: letter and meaning
     "ok": ("", "right"),
@@ -70,6 +69,7 @@ OUTCOMES = {  # mildest first: letter and meaning
     "capacity": ("C", "more contacts than the buffers hold"),
     "nonfinite": ("N", "not finite"),
     "collapse": ("c", "inelastic collapse"),
+    "gives_up": ("x", "the program gives up"),
 }
 
 
@@ -92,7 +92,7 @@ METHODS: dict[str, dict[str, Any]] = {  # of contact dynamics
 }
 PEERS = {
     "event-driven": (event_driven, (0.0,)),
-    "soft discs, LAMMPS": (lammps, STIFFNESSES),
+    SOFT: (lammps, STIFFNESSES),
 }
 
 
@@ -153,7 +153,7 @@ def rows_of_flow(plan: Plan, flow: tuple[float, float]) -> list[dict]:
     reference = None
     if nu != JAMMED:
         found, _ = sheared(longer, flow, states, REFERENCE_TIMESTEP, solver, limit=np.inf)
-        reference = means(found)
+        reference = stress_means([found])
     ways = {
         method: (settings, partial(by_peer, peer, plan, flow, states))
         for method, (peer, settings) in PEERS.items()
@@ -182,17 +182,15 @@ def rows_of_flow(plan: Plan, flow: tuple[float, float]) -> list[dict]:
 
 
 def relative_errors(
-    found: np.ndarray, reference: list[tuple[float, float]] | None
-) -> list[list[float]] | None:
+    found: list[Stress], reference: dict[str, tuple[float, float]] | None
+) -> list[tuple[float, float]] | None:
     """Errors of the stresses of some blocks with standard errors, relative to a reference; None
     without either.
     """
     if len(found) < 2 or reference is None:
         return None
-    return [
-        [value / right - 1, float(np.hypot(error, unsure)) / right]
-        for (value, error), (right, unsure) in zip(means(found), reference, strict=True)
-    ]
+    measured = stress_means([found])
+    return [relative(measured[name], reference[name]) for name in STRESSES]
 
 
 def verdict(row: dict) -> str:
@@ -206,18 +204,9 @@ def verdict(row: dict) -> str:
     errors = row["errors"]
     if errors is not None and max(abs(error) - noise for error, noise in errors) <= RIGHT:
         return "ok"
-    if "LAMMPS" in row["method"]:
+    if row["method"] == SOFT:
         return "too_soft"
-    return {"ok": "silent"}.get(row["outcome"], row["outcome"])
-
-
-def means(found: np.ndarray) -> list[tuple[float, float]]:
-    """Means of pressure and shear stress over blocks (blocks, 2), and their standard errors."""
-    value, error = jackknife(
-        lambda sums: {"mean": sums["found"] / sums["count"][..., None]},
-        {"found": np.asarray(found)[None], "count": np.ones((1, len(found)))},
-    )
-    return list(zip(value["mean"].tolist(), error["mean"].tolist(), strict=True))
+    return "silent" if row["outcome"] == "ok" else row["outcome"]
 
 
 # ----------------------------------------------------------------------------------------------
@@ -257,8 +246,8 @@ def sheared(
     solver: jg.ProjectedMethod | None = None,
     dtype: str = "float64",
     limit: float = SLOW,
-) -> tuple[np.ndarray, dict]:
-    """Pressure and shear stress of the blocks (blocks, 2) of all seeds, what went wrong, and the
+) -> tuple[list[Stress], dict]:
+    """Pressure and shear stress of the blocks of all seeds, what went wrong, and the
     largest overlap; the first block of a seed is left out, and its first part of the time.
     """
     one = flow_of(plan.grains, *flow, dt, dtype)
@@ -267,11 +256,11 @@ def sheared(
         lambda x: jnp.asarray(x, "int32" if isinstance(x, int) else dtype), solver
     )
     total = round(plan.strain / dt)
-    found: list[list[float]] = []
+    found: list[Stress] = []
     worst, deepest = "ok", 0.0
 
-    def ended(outcome: str) -> tuple[np.ndarray, dict]:
-        return np.array(found), {"outcome": outcome, "largest_overlap": deepest}
+    def ended(outcome: str) -> tuple[list[Stress], dict]:
+        return found, {"outcome": outcome, "largest_overlap": deepest}
 
     for first in states:
         state = jax.tree.map(lambda x: x.astype(dtype), first)
@@ -298,7 +287,7 @@ def sheared(
                 worst = "deep_overlap"
             if block:
                 mean = averages(tally, state.side**2, plan.grains, one.shear_rate)
-                found.append([float(mean[name]) for name in STRESSES])
+                found.append(Stress(*(float(mean[name]) for name in STRESSES)))
     return ended(worst)
 
 
@@ -330,18 +319,18 @@ def gains(tally: jg.Tally, rise: float, rounding: float) -> bool:
 
 def by_peer(
     peer: Any, plan: Plan, flow: tuple[float, float], states: list[jg.State], setting: float
-) -> tuple[np.ndarray, dict]:
+) -> tuple[list[Stress], dict]:
     """Stresses of the blocks of all seeds by another program, and how it failed."""
-    failed = "collapse" if peer is event_driven else "nonfinite"
     (curve,), found = peer.CURVES, []
     for state in states:
         try:
-            one: Run = peer.begin(discs_of(state), Flow(*flow), curve, setting, plan.strain)
-            found += [one.advance()[: len(STRESSES)] for _ in range(plan.blocks + 1)][1:]
-            one.close()
+            found += blocks_of(
+                peer, discs_of(state), Flow(*flow), curve, setting, plan.strain, plan.blocks
+            )
         except Exception as failure:  # of a program that is not ours to mend
-            return np.array(found), {"outcome": failed, "detail": str(failure)}
-    return np.array(found), {"outcome": "ok"}
+            outcome = "collapse" if peer is event_driven else "gives_up"
+            return found, {"outcome": outcome, "detail": str(failure)}
+    return found, {"outcome": "ok"}
 
 
 # ----------------------------------------------------------------------------------------------
@@ -410,5 +399,5 @@ def shade_of(method: str, setting: float) -> str:
     """Dark where a coarse setting suffices."""
     if setting == 0:
         return "0.75"
-    settings = STIFFNESSES if method == "soft discs, LAMMPS" else TIMESTEPS
+    settings = STIFFNESSES if method == SOFT else TIMESTEPS
     return str(0.72 + 0.05 * min(settings.index(setting), 4)) if setting in settings else "0.9"

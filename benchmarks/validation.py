@@ -24,10 +24,9 @@ from matplotlib.figure import Figure
 import jaxgran as jg
 from benchmarks.output import Output
 from benchmarks.peers import event_driven, jaxgran_itself, numba_rival
-from benchmarks.peers.problem import Discs, Flow, Stress
+from benchmarks.peers.problem import Flow, averages, blocks_of
 from jaxgran.environment import usable_cores
 from jaxgran.plotting.style import TWO_COLUMNS, styled
-from jaxgran.statistics import jackknife
 
 LABELS = {
     "granular_temperature": "$T$",
@@ -65,12 +64,10 @@ def run(output: Output) -> None:
     dense_first = sorted(plan.flows, key=lambda flow: -flow[1])
     rows = []
     with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
-        for flow, some in zip(
-            dense_first, pool.map(partial(rows_of_flow, plan), dense_first), strict=True
-        ):
+        for some in pool.map(partial(rows_of_flow, plan), dense_first):
             rows += some
             for row in some:
-                print("α = {:g}, ν = {:g}".format(*flow), {**row, "flow": flow}, flush=True)
+                print(", ".join(f"{name} {value}" for name, value in row.items()), flush=True)
     rows.sort(key=lambda row: plan.flows.index((row["alpha"], row["nu"])))
     head = {**plan._asdict(), "timestep": TIMESTEP}
     head["programs"] = {name: summary(rows, name) for name in PROGRAMS}
@@ -97,19 +94,26 @@ def rows_of_flow(plan: Plan, flow: tuple[float, float]) -> list[dict]:
     starts = [
         jaxgran_itself.discs_of(jg.prepare(law, jax.random.key(seed))) for seed in range(plan.seeds)
     ]
-    ours = means(plan, flow, starts, *ITSELF)
+
+    def means(program: ModuleType, curve: str, setting: float) -> dict[str, tuple[float, float]]:
+        return averages(
+            [
+                blocks_of(program, discs, Flow(*flow), curve, setting, plan.strain, plan.blocks)
+                for discs in starts
+            ]
+        )
+
+    ours = means(*ITSELF)
     rows = []
     for name, program in PROGRAMS.items():
         head = {"alpha": alpha, "nu": nu, "program": name}
         try:
-            theirs = means(plan, flow, starts, *program)
+            theirs = means(*program)
         except RuntimeError:  # an inelastic collapse
             rows.append({**head, "observable": None})
             continue
-        for observable in LABELS:
+        for observable in theirs:
             value, reference = ours[observable], theirs[observable]
-            if np.isnan(reference[0]):
-                continue
             quotient = value[0] / reference[0]
             noise = quotient * np.hypot(value[1] / value[0], reference[1] / reference[0])
             rows.append(
@@ -117,31 +121,6 @@ def rows_of_flow(plan: Plan, flow: tuple[float, float]) -> list[dict]:
                 | {"difference": (quotient - 1, float(noise))}
             )
     return rows
-
-
-def means(
-    plan: Plan,
-    flow: tuple[float, float],
-    starts: list[Discs],
-    program: ModuleType,
-    curve: str,
-    setting: float,
-) -> dict[str, tuple[float, float]]:
-    """Averages of all seeds by a program with standard errors; the first block is left out.
-
-    Raises:
-      RuntimeError: event-driven discs collapse.
-    """
-    blocks = []
-    for discs in starts:
-        one = program.begin(discs, Flow(*flow), curve, setting, plan.strain)
-        blocks.append([one.advance() for _ in range(plan.blocks + 1)][1:])
-    sums = {"found": np.array(blocks), "count": np.ones((plan.seeds, plan.blocks))}
-    value, error = jackknife(lambda sums: {"mean": sums["found"] / sums["count"][..., None]}, sums)
-    return {
-        name: (float(value["mean"][k]), float(error["mean"][k]))
-        for k, name in enumerate(Stress._fields)
-    }
 
 
 def summary(rows: list[dict], program: str) -> dict[str, float]:

@@ -18,7 +18,6 @@ of the other program. ``chart.py`` draws the figure.
 
 import os
 import time
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -29,9 +28,8 @@ from benchmarks.output import Output
 from benchmarks.peers import event_driven, jaxgran_itself, lammps, numba_rival
 from benchmarks.peers.chart import draw
 from benchmarks.peers.front import OBSERVABLES, TARGET, table
-from benchmarks.peers.problem import Discs, Flow, Stress
+from benchmarks.peers.problem import Discs, Flow, averages, relative
 from benchmarks.peers.workers import Worker
-from jaxgran.statistics import jackknife
 
 PEERS = (jaxgran_itself, numba_rival, lammps, event_driven)
 REFERENCE_TIMESTEP = 3e-5
@@ -132,7 +130,7 @@ def compare_peers(plan: Plan, case: Case, peers: list) -> dict:
     for k, run in runs.items():
         wall, cpu = np.median(clocks[k], axis=0) / case.strain
         mean, largest = np.mean(depths[k], axis=0)
-        values = averages(stresses[k])
+        values = averages([stresses[k]])
         rows[k] |= {
             "rounds": len(clocks[k]),
             "cpu_seconds_per_strain": float(cpu),
@@ -168,7 +166,7 @@ def reference(
     worker.advance(-1)
     stresses, clocks = zip(*(worker.advance(-1) for _ in range(case.reference_rounds)), strict=True)
     worker.close(-1)
-    return averages(stresses), float(np.median(clocks, axis=0)[1]) / case.strain
+    return averages([stresses]), float(np.median(clocks, axis=0)[1]) / case.strain
 
 
 def first_looks(
@@ -195,24 +193,6 @@ def first_looks(
     except Exception as failure:  # of a program that is not ours to mend
         return row | {"failure": str(failure)}
     return row
-
-
-def averages(stresses: Sequence[Stress]) -> dict[str, tuple[float, float]]:
-    """Means over the rounds and their standard errors; without what a program does not know."""
-    rounds = {
-        name: np.array([[getattr(stress, name) for stress in stresses]]) for name in Stress._fields
-    }
-    rounds["count"] = np.ones((1, len(stresses)))
-    value, error = jackknife(
-        lambda sums: {name: sums[name] / sums["count"] for name in Stress._fields}, rounds
-    )
-    known = [name for name in Stress._fields if np.isfinite(value[name])]
-    return {name: (float(value[name]), float(error[name])) for name in known}
-
-
-def relative(value: tuple[float, float], right: tuple[float, float]) -> tuple[float, float]:
-    """Relative error of a mean, and the standard error of it."""
-    return value[0] / right[0] - 1, float(np.hypot(value[1], right[1])) / right[0]
 
 
 def report(flow: dict) -> None:

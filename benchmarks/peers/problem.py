@@ -7,10 +7,13 @@ The cell has the lattice vectors (side, 0) and (tilt · side, side).
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
+
+from jaxgran.statistics import jackknife
 
 SAFETY = 1.2  # factor by which the fastest disc may become faster between two looks at it
 
@@ -49,6 +52,46 @@ class Run(NamedTuple):
     advance: Callable[[], Stress]  # over the duration that the run was begun with
     discs: Callable[[], Discs]  # as they are now
     close: Callable[[], None] = lambda: None
+
+
+def blocks_of(
+    peer: ModuleType,
+    discs: Discs,
+    flow: Flow,
+    curve: str,
+    setting: float,
+    duration: float,
+    count: int,
+) -> list[Stress]:
+    """Stresses of some successive advances of a run, past a first one that is left out; the run is
+    closed, also where the program fails.
+    """
+    one: Run = peer.begin(discs, flow, curve, setting, duration)
+    try:
+        return [one.advance() for _ in range(count + 1)][1:]
+    finally:
+        one.close()
+
+
+def averages(runs: Sequence[Sequence[Stress]]) -> dict[str, tuple[float, float]]:
+    """Means over the blocks of one or more equally long runs, and their standard errors; without
+    what a program does not know.
+    """
+    blocks = {
+        name: np.array([[getattr(stress, name) for stress in run] for run in runs])
+        for name in Stress._fields
+    }
+    blocks["count"] = np.ones((len(runs), len(runs[0])))
+    value, error = jackknife(
+        lambda sums: {name: sums[name] / sums["count"] for name in Stress._fields}, blocks
+    )
+    known = [name for name in Stress._fields if np.isfinite(value[name])]
+    return {name: (float(value[name]), float(error[name])) for name in known}
+
+
+def relative(value: tuple[float, float], right: tuple[float, float]) -> tuple[float, float]:
+    """Relative error of a mean, and the standard error of it."""
+    return value[0] / right[0] - 1, float(np.hypot(value[1], right[1])) / right[0]
 
 
 def overlaps(discs: Discs) -> tuple[float, float]:
