@@ -165,8 +165,7 @@ BENCHMARKS = (
         "device_batch",
         "How many replica-steps per second does this device make, beside one core of the numba "
         "loop?",
-        (3, 1),
-        options=(Option("--paper", "the map of the paper, too", bool),),
+        (2, 1),
     ),
     Benchmark(
         "speed_vs_accuracy",
