@@ -79,7 +79,9 @@ def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
     flows = jax.tree.map(lambda x: np.full(replicas, x), flow)
     ways = {  # what is done in a call, and how many replica-steps that is
         "device": (
-            partial(advance_batch, flows, DEFAULT_NUMERICS, batch, np.full(replicas, np.int32(steps))),
+            partial(
+                advance_batch, flows, DEFAULT_NUMERICS, batch, np.full(replicas, np.int32(steps))
+            ),
             steps * replicas,
         ),
         "rival": (partial(rivals, flow, distinct, steps), steps * DISTINCT),
