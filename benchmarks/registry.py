@@ -166,6 +166,7 @@ BENCHMARKS = (
         "How many replica-steps per second does this device make, beside one core of the numba "
         "loop?",
         (2, 1),
+        ("device_batch_gpu.json",),
     ),
     Benchmark(
         "speed_vs_accuracy",

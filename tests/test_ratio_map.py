@@ -217,6 +217,20 @@ def test_ratio_map_warns_of_points_and_shows_progress(monkeypatch, capsys) -> No
     assert "2/2 points" in capsys.readouterr().err
 
 
+def test_few_replicas_on_an_accelerator_are_told_that_a_processor_is_faster(
+    monkeypatch, capsys
+) -> None:
+    few = "4 replicas are few for an accelerator"
+    given = {**DEFAULTS, **SETTINGS, "progress": True}
+    ratio_map_module.settle(given)
+    assert few not in capsys.readouterr().err
+    monkeypatch.setattr(ratio_map_module, "in_lockstep", lambda: True)
+    ratio_map_module.settle(given)
+    assert few in capsys.readouterr().err
+    ratio_map_module.settle(given | {"seeds": 500})
+    assert few not in capsys.readouterr().err
+
+
 def test_a_map_that_is_cut_off_is_continued_and_written_once(
     settings, results, tmp_path, monkeypatch
 ) -> None:

@@ -49,6 +49,8 @@ _OF_RUN = (
     *("wall_time_seconds", "replica_steps_per_second"),
 )
 """Attributes of a map that are no parameters and not those of ``run_attributes``."""
+_FEW_ON_AN_ACCELERATOR = 1000
+"""Replicas below which two cores are faster than an accelerator (``benchmarks device_batch``)."""
 
 
 def fill_from_start(function: Callable[P, R]) -> Callable[P, R]:
@@ -169,6 +171,11 @@ def settle(parameters: Mapping[str, Any]) -> tuple[MapSettings, RunOptions]:
     run = replace(run, workers=_workers(run), attributes=attributes)
     if automatic_choice:
         run.tell(f"chosen: {automatic_choice}")
+    if in_lockstep() and replica_count(settings) < _FEW_ON_AN_ACCELERATOR:
+        run.tell(
+            f"{replica_count(settings)} replicas are few for an accelerator and faster on a "
+            "processor: set JAX_PLATFORMS=cpu."
+        )
     return settings, run
 
 
