@@ -158,12 +158,13 @@ def extrapolated(points: dict[str, list[dict]]) -> dict:
 
 def arrays(points: list[dict]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time steps, excess, and its error. Where hardly a cluster was seen the error is a third of
-    that of the next coarser step, as no scatter is no certainty."""
+    that of the next coarser step, as no scatter, whose error is NaN, is no certainty.
+    """
     dt, ratio, error = (
         np.array([p[name] for p in points]) for name in ("timestep", "force_ratio", "stderr")
     )
     for k in range(len(error) - 2, -1, -1):
-        error[k] = max(error[k], error[k + 1] / 3)
+        error[k] = np.fmax(error[k], error[k + 1] / 3)
     return dt, ratio - 1, error
 
 

@@ -7,12 +7,14 @@ import subprocess
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.text import Text
 
 from benchmarks import output
 from benchmarks.draw import PICTURES
 from benchmarks.registry import BENCHMARKS
+from benchmarks.timestep_study import arrays
 
 ROOT = Path(__file__).parents[1]
 
@@ -55,3 +57,11 @@ def test_picture_of_a_result_has_the_width_of_a_column_or_two_and_text_that_can_
         text for text in figure.findobj(Text) if text.get_text().strip() and text.get_visible()
     ]
     assert min(text.get_fontsize() for text in texts) >= 6.99
+
+
+def test_a_time_step_without_scatter_takes_a_third_of_the_error_of_the_next_coarser_one() -> None:
+    found = ((1e-6, 1.0, np.nan), (1e-5, 1.0, 0.0), (1e-4, 1.1, 0.09), (1e-3, 1.2, 0.03))
+    names = ("timestep", "force_ratio", "stderr")
+    _, excess, error = arrays([dict(zip(names, one, strict=True)) for one in found])
+    np.testing.assert_allclose(excess, [0.0, 0.0, 0.1, 0.2], atol=1e-15)
+    np.testing.assert_allclose(error, [0.01, 0.03, 0.09, 0.03])

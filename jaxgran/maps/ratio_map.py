@@ -50,7 +50,7 @@ _OF_RUN = (
 )
 """Attributes of a map that are no parameters and not those of ``run_attributes``."""
 _FEW_ON_AN_ACCELERATOR = 1000
-"""Replicas below which two cores are faster than an accelerator (``benchmarks device_batch``)."""
+"""Replicas below which an accelerator is hardly faster than two cores (``device_batch``)."""
 
 
 def fill_from_start(function: Callable[P, R]) -> Callable[P, R]:
@@ -173,8 +173,8 @@ def settle(parameters: Mapping[str, Any]) -> tuple[MapSettings, RunOptions]:
         run.tell(f"chosen: {automatic_choice}")
     if in_lockstep() and replica_count(settings) < _FEW_ON_AN_ACCELERATOR:
         run.tell(
-            f"{replica_count(settings)} replicas are few for an accelerator and faster on a "
-            "processor: set JAX_PLATFORMS=cpu."
+            f"{replica_count(settings)} replicas are few for an accelerator; a processor may "
+            "be faster: set JAX_PLATFORMS=cpu."
         )
     return settings, run
 
