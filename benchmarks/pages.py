@@ -90,13 +90,14 @@ def percent(value: float, digits: int = 2) -> str:
 
 
 def pm(value: float, error: float) -> str:
-    """A value and its standard error, with a true minus sign.
+    """A value and its standard error, with a true minus sign; the value alone without scatter.
 
     Examples:
-      >>> pm(-0.0123, 0.0042)
-      '−0.012 ± 0.004'
+      >>> pm(-0.0123, 0.0042), pm(1.0, math.nan)
+      ('−0.012 ± 0.004', '1')
     """
-    return with_error(value, error).replace("-", "−")
+    text = f"{value:.4g}" if math.isnan(error) else with_error(value, error)
+    return text.replace("-", "−")
 
 
 def duration(seconds: float, digits: int = 2) -> str:
