@@ -27,8 +27,9 @@ from benchmarks.peers import front
 from benchmarks.solvers.groups import GROUPS
 from jaxgran.maps.automatic import chosen_settings
 from jaxgran.maps.results import open_map
-from jaxgran.maps.schema import shear_stress_ratio
+from jaxgran.maps.schema import flattened, shear_stress_ratio
 from jaxgran.model.display import with_error
+from jaxgran.plotting.factors import CURVES, PREFIX, with_temperature
 from jaxgran.reference.table import FACTORS
 
 BUILD = ROOT / "docs" / "_build"
@@ -127,6 +128,16 @@ def point(file: str, name: str, restitution: float, packing_fraction: float) -> 
     chosen = {"restitution": restitution, "packing_fraction": packing_fraction}
     error = float(data[f"{variable}_stderr"].sel(chosen)) if f"{variable}_stderr" in data else 0.0
     return float(data[variable].sel(chosen)), error
+
+
+def factors(file: str, restitution: float, packing_fraction: float) -> list[float]:
+    """The factors of the theory's contact pressure at a point of a map, in the order of the figure,
+    and their product.
+    """
+    data = with_temperature(flattened(_map(file)))
+    chosen = data.sel(restitution=restitution, packing_fraction=packing_fraction)
+    values = [float(chosen[f"{PREFIX}{name}"]) for name in CURVES]
+    return [*values, math.prod(values)]
 
 
 def shear_stress_ratio_at(
@@ -238,13 +249,14 @@ ENVIRONMENT.filters |= {
     "g": lambda value: f"{float(value):g}",
     "date": lambda number: f"{number // 10000}-{number // 100 % 100:02d}-{number % 100:02d}",
 }
-ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table, "SOLVER_GROUPS": GROUPS}
+ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table}
+ENVIRONMENT.globals |= {"SOLVER_GROUPS": GROUPS, "FACTOR_CURVES": CURVES}
 ENVIRONMENT.globals |= {
     one.__name__: one
     for one in (
         *(max, at, point, quotients, over, ranked),
         *(sig, percent, percent_pm, pm, duration),
-        *(grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where, product_of),
+        *(factors, grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where, product_of),
     )
 }
 ENVIRONMENT.globals |= {

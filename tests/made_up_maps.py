@@ -102,6 +102,11 @@ def factor_of(k: int, x: np.ndarray, nu: np.ndarray) -> np.ndarray:
     return 0.5 * STDERR * (x - x) if k == 0 else (-1.0) ** k * (0.4 * k * x + 0.5 * (nu - 0.55))
 
 
+def temperature_factor_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
+    """Return the logarithm of the synthetic factor of the temperature."""
+    return 0.3 * x + 0.2 * nu
+
+
 def share_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
     return 0.08 + 0.6 * x + 0.6 * (nu - 0.4)
 
@@ -127,6 +132,15 @@ def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
             for a, b in ((0, 0), (1, 1)) if name == "pressure" else ((0, 1), (1, 0)):
                 tensor[..., a, b] = part if a == b else -part
         added[f"theory/{name}"] = (DIMS, binary * np.exp(closure_of(x, nu)))
+    theory = added["theory/pressure"][1]
+    temperature = np.full(theory.shape, 1.5)
+    enskog = 0.85 * theory * np.exp(temperature_factor_of(x, nu))
+    added |= {
+        "granular_temperature": (DIMS, temperature),
+        "theory/granular_temperature": (DIMS, 0.5 * temperature * theory / added["pressure"][1]),
+        "theory/enskog_pressure": (DIMS, enskog),  # the theory's is 0.85 of its pressure
+        "theory/enskog_pressure_stderr": (DIMS, STDERR * enskog),
+    }
     for k, factor in enumerate(FACTORS):
         value = np.exp(factor_of(k, x, nu)) * np.ones(data.force_ratio.shape)
         name = f"{PREFIX}{factor}"

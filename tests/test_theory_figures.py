@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 import xarray as xr
 from drawn import contour_lines, write_without_drawing
-from made_up_maps import STDERR, assumption_of, closure_of, factor_of, theory_dataset
+from made_up_maps import (
+    STDERR,
+    assumption_of,
+    closure_of,
+    factor_of,
+    temperature_factor_of,
+    theory_dataset,
+)
 
 from jaxgran.plotting.factors import FACTORS, enskog_factors
 from jaxgran.plotting.map_figures import save_figures
@@ -67,13 +74,15 @@ def test_factors_and_their_product_are_curves_with_names_at_their_ends() -> None
     ]
     nu = data.packing_fraction.values
     for axes, alpha in zip(figure.axes, (0.9, 0.5, 0.1), strict=True):
-        logs = [factor_of(k, 1 - alpha + 0 * nu, nu) for k in range(len(FACTORS))]
+        x = 1 - alpha + 0 * nu
+        logs = [temperature_factor_of(x, nu), *(factor_of(k, x, nu) for k in range(len(FACTORS)))]
         for bars, log in zip(axes.containers, logs, strict=True):
             np.testing.assert_allclose(bars.lines[0].get_xydata(), np.stack([nu, np.exp(log)], -1))
         (product,) = (line for line in axes.lines if line.get_linewidth() == 2.2)
         np.testing.assert_allclose(product.get_ydata(), np.exp(np.sum(logs, axis=0)))
     names = [text.get_text() for text in figure.axes[-1].texts]
-    assert sorted(names) == sorted(["measured/Enskog", *(name for name, *_ in FACTORS.values())])
+    factors = (name for name, *_ in FACTORS.values())
+    assert sorted(names) == sorted(["measured/theory", "temperature", *factors])
 
 
 # --------------------------------------------------------------------------------------------
@@ -117,7 +126,7 @@ def test_map_without_any_value_is_drawn(draw) -> None:
         (theory_dataset(1, 3), ["curves", "factors", "clusters"]),
         (
             theory_dataset(3, 3).drop_vars("theory/pressure"),
-            ["curves", "contours", "factors", "clusters"],
+            ["curves", "contours", "clusters"],
         ),
         (
             theory_dataset(3, 3).drop_vars(

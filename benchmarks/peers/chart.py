@@ -18,7 +18,7 @@ from jaxgran.plotting.style import (
 )
 
 LEAST, MOST = 1e-3, 1.5  # errors at the ends of the axis
-TIMES = 1.5, 15_000  # µs, at the ends of the axis
+TIMES = 1.5, 25_000  # µs, at the ends of the axis
 
 
 class Look(NamedTuple):
@@ -36,14 +36,14 @@ class Look(NamedTuple):
 
 LOOKS = {
     "LAMMPS": Look(
-        "soft discs, LAMMPS", "#b35806", "D", "-", "k", ((0.42, 0.76), (0.47, 0.82), (0.5, 0.82))
+        "soft discs, LAMMPS", "#b35806", "D", "-", "k", ((0.42, 0.76), (0.47, 0.82), (0.47, 0.82))
     ),
     "numba loop": Look(
         "Gauss–Seidel loop", "0.55", "s", "--", "", (None, (0.04, 0.5), (0.04, 0.22))
     ),
     "jaxgran": Look("jaxgran", "black", "o", "-", "dt", ((0.04, 0.4), (0.04, 0.57), (0.04, 0.29))),
     "event-driven": Look(
-        "event-driven", "tab:blue", "*", "", "", ((0.25, 0.24), (0.39, 0.14), (0.04, 0.04))
+        "event-driven", "tab:blue", "*", "", "", ((0.125, 0.265), (0.37, 0.14), (0.04, 0.04))
     ),
 }
 
@@ -61,7 +61,7 @@ def draw(result: dict) -> Figure:
     for axes, flow, letter in zip(panels, flows, "abc", strict=False):
         axes.set(xscale="log", yscale="log", ylim=(LEAST, MOST), xlim=TIMES)
         value, noise = flow["reference"]["pressure"]
-        axes.axhspan(LEAST, 2 * noise / value, color="0.9", zorder=0, lw=0)
+        axes.axhspan(LEAST, 2 * noise / value, color="#f6d5a4", alpha=0.6, zorder=0, lw=0)
         for curve, look in LOOKS.items():
             _draw_curve(axes, flow, curve, look, look.places["abc".index(letter)])
         alpha, nu = flow["restitution"], flow["packing_fraction"]
@@ -87,7 +87,7 @@ def _draw_curve(
     style = {"color": look.colour, "fontsize": SMALL_SIZE}
     rows = rows_of(flow, curve)
     if place and any(row["curve"] == curve for row in flow["rows"]):
-        label = look.label if rows else f"$\\times$ {look.label}: collapses"
+        label = look.label if rows else f"$\\times$ {look.label}\n    collapses"
         axes.text(*place, label, transform=axes.transAxes, **style)
     if not rows:
         return

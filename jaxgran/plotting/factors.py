@@ -1,5 +1,5 @@
-"""Which assumption of kinetic theory fails: the factors between Enskog's pressure and the measured
-one.
+"""Which assumption of kinetic theory fails: the factors between its contact pressure and the
+measured one.
 """
 
 from __future__ import annotations
@@ -32,12 +32,22 @@ FACTORS = {
     "pairs": ("pairs at contact", "#8a5aa8", "D"),
     "binary": ("binary collisions", "#c0392b", "v"),
 }
-"""Factors of the contact pressure: their names, colours and markers."""
+"""Factors of the contact pressure over Enskog's at the measured granular temperature: their names,
+colours and markers.
+"""
 
 PREFIX = "theory/enskog_factor_pressure_"
 """Beginning of the names of their variables."""
 
-_PRODUCT = ("measured/Enskog", "black", "")
+CURVES = {"temperature": ("temperature", "#2a8c4a", "P")} | FACTORS
+"""The same after the factor of the temperature, over the contact pressure of the whole theory."""
+
+_TEMPERATURE = f"{PREFIX}temperature"
+_PRODUCT = ("measured/theory", "black", "")
+_OF_TEMPERATURE = (
+    *("granular_temperature", "stresses/kinetic_stress", "theory/granular_temperature"),
+    *("theory/pressure", "theory/enskog_pressure"),
+)
 _NEEDED = [f"{PREFIX}{name}{end}" for name in FACTORS for end in ("", "_stderr")]
 _MOST_PANELS = 3
 _LABEL_HEIGHT = 0.07  # in heights of the panel
@@ -45,28 +55,49 @@ _LABEL_HEIGHT = 0.07  # in heights of the panel
 
 def has_factors(data: xr.Dataset) -> bool:
     """Return whether a map has the variables and the range that :func:`enskog_factors` draws."""
-    return data.sizes["packing_fraction"] >= 2 and not what_lacks(data, *RATIO, *_NEEDED)
+    return data.sizes["packing_fraction"] >= 2 and not what_lacks(
+        data, *RATIO, *_NEEDED, *_OF_TEMPERATURE
+    )
+
+
+def with_temperature(data: xr.Dataset) -> xr.Dataset:
+    """Return a map with the factor of the temperature: Enskog's contact pressure at the measured
+    temperature over that of the whole theory, whose balance of energy predicts another one.
+    """
+    kinetic = abs(sum(data["stresses/kinetic_stress"][..., a, a] for a in (0, 1))) / 2.0
+    density = kinetic / data.granular_temperature  # grains over area
+    contact = data["theory/pressure"] - density * data["theory/granular_temperature"]
+    enskog = "theory/enskog_pressure"
+    return data.assign(
+        {
+            _TEMPERATURE: data[enskog] / contact,
+            f"{_TEMPERATURE}_stderr": data[f"{enskog}_stderr"] / contact,
+        }
+    )
 
 
 @styled
 def enskog_factors(data: MapData) -> Figure:
-    """Return the factors by which the contact pressure differs from Enskog's, and their product,
-    against the packing fraction.
+    """Return the factors by which the contact pressure differs from that of kinetic theory, and
+    their product, against the packing fraction.
 
     Each factor is the pressure with one more assumption replaced by what was measured, over the
-    pressure before: see ``jaxgran.sampling.enskog_factors``. Their product, the measured pressure
-    over Enskog's, is the thick line. Each of at most three restitutions has a panel.
+    pressure before. The first replaces the temperature that the theory predicts; for the others see
+    ``jaxgran.sampling.enskog_factors``. Their product, the measured contact pressure over the
+    theory's, is the thick line. Each of at most three restitutions has a panel.
 
     Args:
-      data: a map with `theory/enskog_factor_pressure_...` and `force_ratio`, with `_stderr`, and
-        `status`. The largest of several numbers of grains and the shortest of several time steps
-        are drawn.
+      data: a map with `theory/enskog_factor_pressure_...` and `force_ratio`, with `_stderr`, the
+        temperatures and pressures of flow and theory, and `status`. The largest of several numbers
+        of grains and the shortest of several time steps are drawn.
 
     Returns:
       Error bars are one standard error; a point whose status is not `ok` is an open symbol in a
       ring.
     """
-    data = selection(data, *(f"{PREFIX}{name}" for name in FACTORS))
+    data = with_temperature(
+        selection(data, *_OF_TEMPERATURE, *(f"{PREFIX}{name}" for name in FACTORS))
+    )
     count = data.sizes["restitution"]
     chosen = np.unique(np.round((count - 1) * np.linspace(0.9, 0.1, _MOST_PANELS)).astype(int))
     figure = empty_figure(TWO_COLUMNS, height=3.0)
@@ -82,17 +113,17 @@ def enskog_factors(data: MapData) -> Figure:
     if suspect(data.isel(restitution=chosen)).any():
         figure.legend(handles=[Line2D([], [], **RING)], loc="outside upper left")
     shown = data.isel(restitution=chosen)
-    logs = np.log(
-        [shown[f"{PREFIX}{name}"].where(shown[f"{PREFIX}{name}"] > 0) for name in FACTORS]
-    )
-    right, all_right = (
-        (abs(np.expm1(log)) <= 0.1).sum() for log in (logs.sum(axis=0), abs(logs).max(axis=0))
+    logs = np.log([shown[f"{PREFIX}{name}"].where(shown[f"{PREFIX}{name}"] > 0) for name in CURVES])
+    whole, enskog, all_right = (
+        (abs(np.expm1(log)) <= 0.1).sum()
+        for log in (logs.sum(axis=0), logs[1:].sum(axis=0), abs(logs[1:]).max(axis=0))
     )
     describe(
         figure,
         data,
-        f"Enskog's contact pressure is right within 10 % at {right} of {logs[0].size} points, each "
-        f"of its assumptions at {all_right}{': errors cancel' if right > all_right else ''}",
+        f"The theory's contact pressure is right within 10 % at {whole} of {logs[0].size} points, "
+        f"Enskog's at the measured temperature at {enskog}, each of its assumptions at {all_right}"
+        f"{': errors cancel' if enskog > all_right else ''}",
         "Each factor replaces one more assumption by what is measured; thick: their product",
     )
     return figure
@@ -102,8 +133,8 @@ def _draw_factors(axes: Axes, data: xr.Dataset) -> dict[str, float]:
     """Draw factors and product at one restitution; return the last value of each that is known."""
     draw_reference(axes)
     nu, bad = data.packing_fraction.values, suspect(data)
-    values = {name: data[f"{PREFIX}{name}"].values for name in FACTORS}
-    for name, (_, colour, marker) in FACTORS.items():
+    values = {name: data[f"{PREFIX}{name}"].values for name in CURVES}
+    for name, (_, colour, marker) in CURVES.items():
         style = {"color": colour, "marker": marker, "markersize": 3}
         error = data[f"{PREFIX}{name}_stderr"].values
         draw_points(axes, nu, values[name], bad, style, yerr=error)
@@ -122,7 +153,7 @@ def _label_ends(axes: Axes, ends: dict[str, float]) -> None:
     lowest = np.maximum.accumulate(heights - steps) + steps
     highest = np.minimum.accumulate((heights - steps)[::-1])[::-1] + steps
     for name, height in zip(names, (lowest + highest) / 2, strict=True):
-        text, colour, _ = (FACTORS | {"product": _PRODUCT})[name]
+        text, colour, _ = (CURVES | {"product": _PRODUCT})[name]
         axes.annotate(
             text,
             (1.0, to_axes.transform((0, ends[name]))[1]),

@@ -66,7 +66,7 @@ MEASURED_LAWS = CorrelationLaws(
     pairs=np.array([0.373, 0.01559, 1.616]),
     pairs_stderr=np.array([0.02397, 0.0008233, 0.01449]),
     jamming_fraction=np.array(0.8386),
-    scatter=np.array([0.1243, 0.1553, 0.1494]),
+    scatter=np.array([0.1265, 0.1582, 0.1499]),
     restitution_range=np.array([0.1, 0.95]),
     packing_fraction_range=np.array([0.1, 0.82]),
     fitted_to="294 flows of N = 6400 or 1600, dt = 1e-4",
