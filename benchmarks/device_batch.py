@@ -3,8 +3,8 @@
 Replicas of 256 grains are advanced from the same states by what jaxgran takes for this device and,
 a few of them, by the rival. Replica-steps per second are printed and written as JSON, with the
 pressure against that of the rival and the peak of the device's memory where it tells. Where the
-replicas advance in lockstep their number decides the speed, so it is raised. States are prepared on
-the processor.
+replicas advance in lockstep their number decides the speed, so it is raised, and one large flow is
+advanced as well. States are prepared on the processor.
 
     python -m benchmarks device_batch           # a processor: 2 minutes
     python -m benchmarks device_batch --quick   # under a minute
@@ -12,6 +12,7 @@ the processor.
 
 import time
 from functools import partial
+from itertools import product
 
 import jax
 import jax.numpy as jnp
@@ -25,56 +26,57 @@ from jaxgran.dynamics.engine import DEFAULT_NUMERICS, in_lockstep, select_engine
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.observe import advance_batch
 
-POINTS, TIMESTEPS = ((0.9, 0.56), (0.5, 0.7), (0.5, 0.8)), (1e-3, 1e-4)
-REPLICAS = (1000, 16_000)  # the second on an accelerator only
-GRAINS, STRAIN = 256, 0.2
+POINTS = ((0.9, 0.56), (0.5, 0.7), (0.5, 0.8))
+BATCHES = ((1000, 256, 1e-3), (1000, 256, 1e-4))  # replicas, grains, time step
+ACCELERATOR_BATCHES = ((16_000, 256, 1e-3), (16_000, 256, 1e-4), (1, 100_000, 1e-3))
+STRAIN = 0.2
 DISTINCT, APART = 16, 0.5  # states of a batch, and the strain between them
-TURNS = 3
+TURNS, ENOUGH_SECONDS = 3, 60
 
 
 def run(output: Output) -> None:
-    """Compare at every point and number of replicas, print, and write JSON after each."""
-    numbers = REPLICAS if in_lockstep() else REPLICAS[:1]
-    points, timesteps = POINTS, TIMESTEPS
+    """Compare every batch at every point, print, and write JSON after each."""
+    batches, points = BATCHES + (ACCELERATOR_BATCHES if in_lockstep() else ()), POINTS
     if output.quick:
-        numbers, points, timesteps = (64,), POINTS[:2], TIMESTEPS[:1]
+        batches, points = ((64, 256, 1e-3),), POINTS[:2]
     device = jax.local_devices()[0]
-    print(f"{jax.device_count()} × {device.device_kind}, {GRAINS} grains; replica-steps/s")
+    print(f"{jax.device_count()} × {device.device_kind}; replica-steps/s")
     print(
-        "     dt     α     ν  replicas  device  one core of the rival  ratio  pressure  compiled, s"
+        "replicas  grains     dt     α     ν  device  one core of the rival  ratio  pressure"
+        "  compiled, s"
     )
-    head = {"device": device.device_kind, "devices": jax.device_count(), "grains": GRAINS}
+    head = {"device": device.device_kind, "devices": jax.device_count()}
     rows = []
-    for replicas in numbers:
-        for dt in timesteps:
-            for alpha, nu in points:
-                rows.append(compare(alpha, nu, dt, replicas))
-                print(
-                    "{dt:7.0e}{alpha:6.2g}{nu:6.2g}{replicas:10d}{device:8.2g}{rival:23.2g}"
-                    "{ratio:7.2g}{pressure:10.5f}{compilation:14.1f}".format(**rows[-1]),
-                    flush=True,
-                )
-                memory = (device.memory_stats() or {}).get("peak_bytes_in_use")
-                output.write_rows(
-                    f"device_batch_{device.platform}", head | {"peak_bytes": memory}, "rows", rows
-                )
+    for (replicas, grains, dt), (alpha, nu) in product(batches, points):
+        flow = jg.ShearFlow(grains=grains, restitution=alpha, packing_fraction=nu, timestep=dt)
+        about = {"replicas": replicas, "grains": grains, "dt": dt, "alpha": alpha, "nu": nu}
+        rows.append(about | compare(flow, dt, replicas))
+        print(
+            "{replicas:8d}{grains:8d}{dt:7.0e}{alpha:6.2g}{nu:6.2g}{device:8.2g}{rival:23.2g}"
+            "{ratio:7.2g}{pressure:10.5f}{compilation:13.1f}".format(**rows[-1]),
+            flush=True,
+        )
+        memory = (device.memory_stats() or {}).get("peak_bytes_in_use")
+        output.write_rows(
+            f"device_batch_{device.platform}", head | {"peak_bytes": memory}, "rows", rows
+        )
 
 
-def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
+def compare(flow: jg.ShearFlow, dt: float, replicas: int) -> dict:
     """Replica-steps per second from the same states, the fastest of some calls in turn, and the
     mean pressure of the device over that of the processor.
     """
-    flow = jg.ShearFlow(grains=GRAINS, restitution=alpha, packing_fraction=nu, timestep=dt)
     steps = round(STRAIN / dt)
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         state = jg.prepare(flow, jax.random.key(0), equilibrate=5.0)
         forward = jax.jit(jg.advance)
         distinct = [
-            state := forward(flow, state, jnp.int32(round(APART / dt)))[0] for _ in range(DISTINCT)
+            state := forward(flow, state, jnp.int32(round(APART / dt)))[0]
+            for _ in range(min(DISTINCT, replicas))
         ]
         tallies = [forward(flow, one, jnp.int32(steps))[1] for one in distinct]
         distinct, tallies = jax.device_get((distinct, tallies))
-    which = np.arange(replicas) % DISTINCT
+    which = np.arange(replicas) % len(distinct)
     batch = jax.tree.map(lambda *x: np.stack(x)[which], *distinct)
     flows = jax.tree.map(lambda x: np.full(replicas, x), flow)
     ways = {  # what is done in a call, and how many replica-steps that is
@@ -84,23 +86,22 @@ def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
             ),
             steps * replicas,
         ),
-        "rival": (partial(rivals, flow, distinct, steps), steps * DISTINCT),
+        "rival": (partial(rivals, flow, distinct, steps), steps * len(distinct)),
     }
     seconds = {name: [] for name in ways}
     pressures = [pressure(tally, flow, distinct[0]) for tally in tallies]
-    for _ in range(1 + TURNS):  # the first compiles
+    begun = time.perf_counter()
+    for turn in range(1 + TURNS):  # the first compiles
+        if turn > 1 and time.perf_counter() - begun > ENOUGH_SECONDS:
+            break
         for name, (call, _) in ways.items():
             start = time.perf_counter()
             result = jax.block_until_ready(call())
             seconds[name].append(time.perf_counter() - start)
             if name == "device":
-                found = pressure(result[1], flow, distinct[0])[:DISTINCT]
+                found = pressure(result[1], flow, distinct[0])[: len(distinct)]
     speeds = {name: done / min(seconds[name][1:]) for name, (_, done) in ways.items()}
     return {
-        "alpha": alpha,
-        "nu": nu,
-        "dt": dt,
-        "replicas": replicas,
         "engine": select_engine(flow, DEFAULT_NUMERICS).name,
         **speeds,
         "ratio": speeds["device"] / speeds["rival"],
@@ -112,7 +113,9 @@ def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
 def pressure(tally: jg.Tally, flow: jg.ShearFlow, state: jg.State) -> np.ndarray:
     """Pressure of one sample, or of each of a batch."""
     area = float(state.side) ** 2
-    return np.asarray(averages(jax.device_get(tally), area, GRAINS, flow.shear_rate)["pressure"])
+    return np.asarray(
+        averages(jax.device_get(tally), area, flow.grains, flow.shear_rate)["pressure"]
+    )
 
 
 def rivals(flow: jg.ShearFlow, states: list[jg.State], steps: int) -> None:

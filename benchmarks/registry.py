@@ -50,6 +50,12 @@ BENCHMARKS = (
         ("validation.json", "validation.png"),
     ),
     Benchmark(
+        "elastic_limit",
+        "Is kinetic theory right in loose, nearly elastic flow, and at which number of grains?",
+        (20, 0.5),
+        ("elastic_limit.json",),
+    ),
+    Benchmark(
         "enskog_factors",
         "Which assumption of kinetic theory fails, and what of it survives dt → 0 and N → ∞?",
         (3, 0.5),
