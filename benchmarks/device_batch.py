@@ -28,7 +28,7 @@ from jaxgran.sampling.observe import advance_batch
 
 POINTS = ((0.9, 0.56), (0.5, 0.7), (0.5, 0.8))
 BATCHES = ((1000, 256, 1e-3), (1000, 256, 1e-4))  # replicas, grains, time step
-ACCELERATOR_BATCHES = ((16_000, 256, 1e-3), (16_000, 256, 1e-4), (1, 100_000, 1e-3))
+ACCELERATOR_BATCHES = ((1, 100_000, 1e-3), (16_000, 256, 1e-3), (16_000, 256, 1e-4))
 STRAIN = 0.2
 DISTINCT, APART = 16, 0.5  # states of a batch, and the strain between them
 TURNS, ENOUGH_SECONDS = 3, 60
