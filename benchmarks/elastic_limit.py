@@ -4,9 +4,9 @@ of grains.
 Averages over those of moments of an anisotropic Gaussian. What remains at vanishing packing
 fraction is the error of the Gaussian: its viscosity is 2.2 % below Enskog's (D. M. Gass, J. Chem.
 Phys. 54, 1898, 1971). What grows with the number of grains is the share of long waves of velocity.
-A flow is prepared until steady and sampled over a strain of 16,000/√N.
+A flow is prepared until steady and sampled over a strain of 20,000/√N.
 
-    python -m benchmarks elastic_limit           # about 20 minutes on two cores
+    python -m benchmarks elastic_limit           # about 15 minutes on two cores
     python -m benchmarks elastic_limit --quick   # one flow of 100 and 400 grains, half a minute
 """
 
@@ -40,7 +40,7 @@ class Plan(NamedTuple):
     strain: float
 
 
-FULL = Plan((0.98, 0.9), (0.02, 0.1, 0.3), (400, 1600, 6400, 25_600), 4, 16_000)
+FULL = Plan((0.98, 0.9), (0.02, 0.1, 0.3), (400, 1600, 6400, 25_600), 4, 20_000)
 QUICK = Plan((0.98,), (0.1,), (100, 400), 2, 2_000)
 
 

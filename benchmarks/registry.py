@@ -52,7 +52,7 @@ BENCHMARKS = (
     Benchmark(
         "elastic_limit",
         "Is kinetic theory right in loose, nearly elastic flow, and at which number of grains?",
-        (20, 0.5),
+        (15, 0.5),
         ("elastic_limit.json",),
     ),
     Benchmark(
