@@ -221,7 +221,7 @@ def lammps_ratio(flow: Mapping[str, Any]) -> str:
 
 
 def output_of_where(restitution: float, packing_fraction: float) -> str:
-    """The verdict and the averages that ``jaxgran where`` prints."""
+    """What ``jaxgran where`` prints, without empty lines in its table."""
     command = f"where --restitution {restitution} --packing-fraction {packing_fraction}"
     environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1"}
     done = subprocess.run(
@@ -231,7 +231,7 @@ def output_of_where(restitution: float, packing_fraction: float) -> str:
         check=True,
         env=environment,
     )
-    verdict, table = done.stdout.split("Reference map")[0].split("α = ")
+    verdict, table = done.stdout.split("α = ")
     lines = [line.rstrip() for line in f"α = {table}".splitlines()]
     return "\n".join([textwrap.fill(" ".join(verdict.split()), 100), "", *filter(None, lines)])
 

@@ -6,8 +6,8 @@ stiffness k of soft discs; event-driven discs have none. From the same steady st
 256 discs, every setting is sheared on, and pressure and shear stress are compared with a reference:
 the default at dt = 1e-4 and a tolerance of 1e-6. A cell of the figure is the coarsest setting that
 is right: both stresses within 5 % and one standard error, of one to three per cent, there and at
-the next finer setting, with which the search ends. Where none is, its letter says what happened at
-the finest setting (``OUTCOMES``).
+the next finer setting, with which the search ends. Where none is, a word says what happened at the
+finest setting (``OUTCOMES``).
 
 Contact dynamics is stopped by the first block of strain that fails: a solve above the tolerance, no
 impulses, too many contacts, a number that is not finite, or energy that was gained, which is a
@@ -57,19 +57,20 @@ RIGHT = 0.05  # relative error of pressure and shear stress, and a standard erro
 STRESSES = ("pressure", "shear_stress")
 SLOW = 5e-3  # s of processor time for a grain and a unit of strain; the default takes 0.15 ms
 GAIN = {"float64": 1e-6, "float32": 1e-3}  # of the energies exchanged, which rounding explains
-OUTCOMES = {  # mildest first: letter and meaning
-    "ok": ("", "right"),
-    "too_slow": ("$", "too slow"),
-    "too_soft": ("s", "too soft"),
-    "silent": ("!", "wrong, and no status says so"),
-    "iteration_limit": ("t", "solves end above the tolerance"),
-    "deep_overlap": ("o", "deep overlaps"),
-    "infeasible": ("J", "jammed: no impulses exist"),
-    "energy_gain": ("E", "energy gained"),
-    "capacity": ("C", "more contacts than the buffers hold"),
-    "nonfinite": ("N", "not finite"),
-    "collapse": ("c", "inelastic collapse"),
-    "gives_up": ("x", "the program gives up"),
+OUTCOMES = {  # mildest first, with the word in a cell
+    "ok": "right",
+    "no_reference": "–",  # it runs, and there is nothing to compare with
+    "too_slow": "too slow",
+    "too_soft": "too soft",
+    "silent": "silent",  # wrong, and no status says so
+    "iteration_limit": "tolerance",  # solves end above it
+    "deep_overlap": "overlaps",
+    "infeasible": "jammed",  # no impulses exist
+    "energy_gain": "energy",  # is gained
+    "capacity": "capacity",  # more contacts than the buffers hold
+    "nonfinite": "not finite",
+    "collapse": "collapse",
+    "gives_up": "gives up",
 }
 
 
@@ -197,7 +198,7 @@ def verdict(row: dict) -> str:
     """What became of a setting: "ok" if it ran to its end and is right, whatever its overlaps are.
 
     A wrong one has the outcome of its run. If that is "ok" it is silent, as nothing tells. Nothing
-    is right in a jammed packing.
+    is right in a jammed packing of rigid discs, and nothing is known of soft ones.
     """
     if row["outcome"] not in ("ok", "deep_overlap"):
         return row["outcome"]
@@ -205,7 +206,7 @@ def verdict(row: dict) -> str:
     if errors is not None and max(abs(error) - noise for error, noise in errors) <= RIGHT:
         return "ok"
     if row["method"] == SOFT:
-        return "too_soft"
+        return "no_reference" if errors is None else "too_soft"
     return "silent" if row["outcome"] == "ok" else row["outcome"]
 
 
@@ -339,18 +340,20 @@ def by_peer(
 
 def cells(rows: list[dict]) -> Iterator[tuple[float, float, str, float | None, str]]:
     """α, ν and method of each cell, the coarsest setting from which on all are right that are not
-    too slow, and the outcome of the finest one.
+    too slow, and its outcome; or None and the verdict on the finest one, or on one that has nothing
+    to compare with.
     """
     keys = dict.fromkeys((row["alpha"], row["nu"], row["method"]) for row in rows)
     for key in keys:
         column = [row for row in rows if (row["alpha"], row["nu"], row["method"]) == key]
         verdicts = [verdict(row) for row in column]
-        coarsest = None
+        coarsest, outcome = None, "no_reference" if "no_reference" in verdicts else verdicts[-1]
         for row, judged in zip(reversed(column), reversed(verdicts), strict=True):
             if judged not in ("ok", "too_slow"):
                 break
-            coarsest = row["setting"] if judged == "ok" else coarsest
-        yield *key, coarsest, verdicts[-1]
+            if judged == "ok":
+                coarsest, outcome = row["setting"], row["outcome"]
+        yield *key, coarsest, outcome
 
 
 @styled
@@ -360,17 +363,15 @@ def draw(rows: list[dict]) -> Figure:
     flows = list(dict.fromkeys((row["alpha"], row["nu"]) for row in rows))
     figure = empty_figure(TWO_COLUMNS, 2.5)
     axes = figure.add_subplot()
-    letters = set()
     for alpha, nu, method, setting, outcome in cells(rows):
         x, y = flows.index((alpha, nu)), methods.index(method)
         if setting is None:
-            text, colour = OUTCOMES[outcome][0], "#f4a582"
-            letters.add(outcome)
+            text, colour = OUTCOMES[outcome], "white" if outcome == "no_reference" else "#f4a582"
         else:
             text, colour = text_of(method, setting), shade_of(method, setting)
+            text += " *" * (outcome == "deep_overlap")
         axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
-        weight = "bold" if setting is None else "normal"
-        axes.text(x, y, text, ha="center", va="center", fontsize=SMALL_SIZE, weight=weight)
+        axes.text(x, y, text, ha="center", va="center", fontsize=SMALL_SIZE)
     axes.set(xlim=(-0.5, len(flows) - 0.5), ylim=(len(methods) - 0.5, -0.5))
     names = [f"{alpha:g}\n{nu:g}" for alpha, nu in flows]
     axes.set_xticks(range(len(flows)), names)
@@ -378,11 +379,12 @@ def draw(rows: list[dict]) -> Figure:
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
     axes.text(-0.6, -1.05, r"$\alpha$" + "\n" + r"$\nu$", ha="right", va="center")
     axes.spines[:].set_visible(False)
-    key = "   ".join(
-        f"{OUTCOMES[name][0]}  {OUTCOMES[name][1]}" for name in OUTCOMES if name in letters
+    axes.set_xlabel(
+        r"numbers: $\mathrm{d}t$ in $1/\dot\gamma$; of soft discs $k$ in $m\dot\gamma^2$; "
+        "darker: coarser; *: largest overlap above 0.01 σ\n"
+        "tolerance: solves end above it; –: runs, with nothing to compare (rigid discs are jammed)",
+        fontsize=SMALL_SIZE,
     )
-    units = r"numbers: $\mathrm{d}t$ in $1/\dot\gamma$; of soft discs $k$ in $m\dot\gamma^2$"
-    axes.set_xlabel(f"{units}\n{key}", fontsize=SMALL_SIZE)
     return figure
 
 

@@ -9,7 +9,7 @@ A grid of restitutions α and packing fractions ν as one batch:
     import jaxgran as jg
 
     jg.use_cache()  # compiled programs are kept on disk
-    alphas, nus = jnp.array([(a, n) for n in (0.5, 0.6, 0.7) for a in (0.3, 0.6, 0.9)]).T
+    alphas, nus = jnp.array([(0.3, 0.5), (0.9, 0.5), (0.3, 0.7), (0.9, 0.7)]).T
     flows = jg.ShearFlow(grains=64, restitution=alphas, packing_fraction=nus, timestep=1e-3)
     states = jg.prepare(flows, jax.random.split(jax.random.key(0), len(alphas)))  # until steady
     states, samples = jg.sample(flows, states, strain=5.0)  # or jax.vmap(jg.sample, (0, 0, None))

@@ -3,12 +3,14 @@
 import numpy as np
 import xarray as xr
 
+from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.plotting.factors import FACTORS, PREFIX
 
 FLAGS = "ok iteration_limit not_steady deep_overlap infeasible capacity nonfinite"
 RATE = 8.0  # of the growth of the synthetic excess with 1 − α and with 2ν
 DIMS = ("packing_fraction", "restitution")
 STDERR = 0.02  # of every stress in a map of the theory, relative
+GROWTH = 1.07  # of a stress from the grains of such a map to a large system
 
 
 def excess_of(restitution: np.ndarray, packing_fraction: np.ndarray) -> np.ndarray:
@@ -126,12 +128,18 @@ def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
         measured = scale * np.exp(2.0 * nu) * np.ones_like(x)
         binary = measured * np.exp(assumption_of(x, nu))
         added |= {name: (DIMS, measured), f"{name}_stderr": (DIMS, STDERR * measured)}
+        large = f"{name}_large_system"
+        half = HALF_INTERVAL * STDERR * GROWTH * measured[..., None]
+        added |= {
+            large: (DIMS, GROWTH * measured),
+            f"{large}_ci95": ((*DIMS, "error_source"), half),
+        }
         for tensor, part in zip(
             tensors.values(), (0.3 * measured, binary - 0.3 * measured), strict=True
         ):
             for a, b in ((0, 0), (1, 1)) if name == "pressure" else ((0, 1), (1, 0)):
                 tensor[..., a, b] = part if a == b else -part
-        added[f"theory/{name}"] = (DIMS, binary * np.exp(closure_of(x, nu)))
+        added[f"theory/{name}"] = (DIMS, GROWTH * binary * np.exp(closure_of(x, nu)))
     theory = added["theory/pressure"][1]
     temperature = np.full(theory.shape, 1.5)
     enskog = 0.85 * theory * np.exp(temperature_factor_of(x, nu))
@@ -158,4 +166,4 @@ def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
             name: (DIMS, share_of(x, nu)),
             f"{name}_stderr": (DIMS, np.full((nus, alphas), 0.03)),
         }
-    return data.assign(added)
+    return data.assign(added).assign_coords(error_source=["total"])

@@ -182,7 +182,7 @@ def test_example_of_the_readme_runs_and_stands_in_the_help(capsys: pytest.Captur
         )
         for text in (capsys.readouterr().out, readme)
     )
-    assert printed.shape == (9, 4)
+    assert printed.shape == (4, 4)
     np.testing.assert_array_equal(printed[:, :2], shown[:, :2])
     assert np.all(
         abs(printed[:, 2] - shown[:, 2])

@@ -46,8 +46,9 @@ def test_a_setting_is_silent_only_if_nothing_tells_that_it_is_wrong() -> None:
     ):
         row = {"method": "default", "outcome": outcome, "errors": errors}
         assert stability.verdict(row) == judged
-    soft = {"method": "soft discs, LAMMPS", "outcome": "ok", "errors": [[0.1, 0.0]]}
-    assert stability.verdict(soft) == "too_soft"
+    soft = {"method": "soft discs, LAMMPS", "outcome": "ok"}
+    assert stability.verdict(soft | {"errors": [[0.1, 0.0]]}) == "too_soft"
+    assert stability.verdict(soft | {"errors": None}) == "no_reference"
 
 
 def test_parts_of_a_block_make_it_up() -> None:

@@ -30,6 +30,7 @@ from jaxgran.plotting.theory import ERROR_LEVELS, cluster_shares, error_parts, t
 def test_errors_are_those_of_all_assumptions_and_of_the_binary_one(quantity: str) -> None:
     data = theory_dataset()
     parts = {name: value for name, (value, _) in error_parts(data, quantity).items()}
+    np.testing.assert_allclose(error_parts(data, quantity)["total"][1], STDERR)
     x, nu = 1.0 - data.restitution.values[None, :], data.packing_fraction.values[:, None]
     binary = assumption_of(x, nu)
     np.testing.assert_allclose(parts["total"], binary + closure_of(x, nu), atol=1e-14)

@@ -169,12 +169,17 @@ def test_single_precision_is_refused_where_jax_traces() -> None:
         jax.jit(jg.validity)(0.5, 0.5)
 
 
-def made(error: float, ci95: float, ratio: float = 1.0, **factors: float) -> Validity:
+def made(
+    error: float, ci95: float, ratio: float = 1.0, of_temperature: float = -0.1, **factors: float
+) -> Validity:
     all_factors = dict.fromkeys(FACTORS, np.array(1.0)) | {
         name: np.array(x) for name, x in factors.items()
     }
     measured = {"force_ratio": np.array(ratio)}, {"force_ratio": np.array(0.001)}
-    errors = {"pressure": np.array(error)}, {"pressure": np.array(ci95)}
+    errors = [
+        {"pressure": np.array(x), "local_granular_temperature": np.array(y)}
+        for x, y in ((error, of_temperature), (ci95, 0.03))
+    ]
     return Validity(
         np.array(0.5), np.array(0.5), *measured, {}, *errors, {}, {}, {}, all_factors, {}
     )
@@ -184,18 +189,32 @@ def made(error: float, ci95: float, ratio: float = 1.0, **factors: float) -> Val
     ("found", "said"),
     [
         (
-            made(-0.05, 0.02, chaos=0.8),
-            ("underestimates the pressure by 5.0 ± 2.0 %", "correlated", "binary to 0.1 %"),
-        ),
-        (made(0.2, 0.02, pairs=0.7), ("overestimates the pressure by 20.0 ± 2.0 %", "fewer pairs")),
-        (
-            made(0.01, 0.02, anisotropy=1.1, pairs=1.05),
+            made(-0.05, 0.02, chaos=0.8, pairs=1.1),
             (
-                "agrees with the measured pressure",
-                "departure from Enskog's assumptions: velocities are anisotropic",
+                "pressure by 5.0 ± 2.0 % and the local temperature by 10.0 ± 3.0 %; the contact",
+                "is 0.880 times Enskog's",
+                "correlated (a factor of 0.8)",
+                "binary within 0.1 %",
             ),
         ),
-        (made(0.01, 0.02), ("agrees with the measured pressure", "no assumption")),
+        (
+            made(0.2, 0.02, pairs=0.7),
+            (
+                "overestimates the pressure by 20.0 ± 2.0 % and underestimates the local",
+                "fewer pairs",
+            ),
+        ),
+        (
+            made(0.01, 0.02, of_temperature=0.02, anisotropy=1.1, pairs=1.05),
+            (
+                "agrees with the pressure (error 1.0 ± 2.0 %) and the local temperature (error 2.0",
+                "where velocities are anisotropic",
+            ),
+        ),
+        (
+            made(0.01, 0.02, of_temperature=0.1),
+            ("and overestimates the local temperature by", "every assumption holds"),
+        ),
         (
             made(-0.9, 0.02, 4.0, binary=8.0, pairs=5.0),
             ("in clusters", "explain 25 % of the mean contact force"),

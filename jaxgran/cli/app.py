@@ -42,7 +42,11 @@ COMMANDS = {  # with their help here, as python -OO leaves docstrings out
         EXPLORE_EXAMPLES,
     ),
     "run": (run_command, "Run one flow, and print its averages with errors.", RUN_EXAMPLES),
-    "where": (where_command, "Say whether kinetic theory holds for a flow.", WHERE_EXAMPLES),
+    "where": (
+        where_command,
+        "Say by how much kinetic theory errs in a flow, and why.",
+        WHERE_EXAMPLES,
+    ),
     "info": (info_command, "Print what a bug report needs.", INFO_EXAMPLES),
 }
 

@@ -123,14 +123,24 @@ def draw_beside(
 
 
 def print_tables(data) -> None:
-    """Print the force ratio of every part of a map that has one, and the averages of a large
-    system.
+    """Print the force ratio and the pressure of every part of a map that has them, and the errors
+    of the averages of a large system.
     """
     from jaxgran.maps.schema import parts
 
     for part in parts(data):
         if np.isfinite(part.force_ratio).any():
-            _print_ratio(part)
+            size = f"{part.attrs['grains']} grains, " if "grains" in part.coords else ""
+            about = (
+                f"{size}dt = {part.attrs['timestep']:g} / shear rate, {part.attrs['activation']} "
+                "activation"
+            )
+            title = f"Force ratio by packing fraction ν and restitution α: {about}"
+            brackets = "In brackets: standard error"
+            _print_plane(part, part.force_ratio, part.force_ratio_stderr, f"{title}. {brackets}")
+            half = part.pressure_large_system_ci95.sel(error_source="total")
+            title = f"Pressure of a large system in m/t²: {about}. In brackets: 95 % half-width"
+            _print_plane(part, part.pressure_large_system, half, title)
     print_large_system(data)
 
 
@@ -159,23 +169,16 @@ map_command = command(MAP_OPTIONS, run_map_command)
 plot_command = command(PLOT_OPTIONS, run_plot_command, argument=FILE)
 
 
-def _print_ratio(data) -> None:
-    """The force ratio of a map with standard errors in brackets; * marks a bad status."""
-    rule = data.attrs["activation"]
-    size = f"{data.attrs['grains']} grains, " if "grains" in data.coords else ""
-    title = (
-        f"Force ratio by packing fraction ν and restitution α: {size}dt = "
-        f"{data.attrs['timestep']:g} / shear rate, {rule} activation. In brackets: standard error "
-        "of the last digits. *: bad status."
-    )
+def _print_plane(data, values, errors, title: str) -> None:
+    """An average of a map with its errors in brackets; * marks a bad status."""
     rows = []
     for nu in data.packing_fraction.values:
-        line = data.sel(packing_fraction=nu)
-        numbers = line.force_ratio.values, line.force_ratio_stderr.values, line.status.values
+        line = (x.sel(packing_fraction=nu).values for x in (values, errors, data.status))
         cells = [
             (in_brackets(value, error) if math.isfinite(value) else "no value")
             + " *" * bool(status)
-            for value, error, status in zip(*numbers, strict=True)
+            for value, error, status in zip(*line, strict=True)
         ]
         rows.append([f"{nu:g}", *cells])
-    print_table(title, ["ν", *(f"α = {x:g}" for x in data.restitution.values)], rows)
+    columns = ["ν", *(f"α = {x:g}" for x in data.restitution.values)]
+    print_table(f"{title} of the last digits. *: bad status.", columns, rows)

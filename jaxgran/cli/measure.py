@@ -31,8 +31,8 @@ _PRINTED = {
     "force_ratio": "force ratio",
     "pressure": "pressure",
     "shear_stress": "shear stress",
-    "granular_temperature": "temperature",
-    "local_granular_temperature": "local temperature",
+    "granular_temperature": "T",
+    "local_granular_temperature": "local T",
     "macroscopic_friction": "friction",
 }
 _SOURCES = {"sampling": "sampling", "timestep": "dt", "size": "size"}  # of errors above 0.4 %
@@ -205,10 +205,16 @@ def _print_large_system(data) -> None:
     point = data.status.size == 1
     size = f"N = {data.attrs['grains']}" if "grains" in data.attrs else "its N"
     values = (size, "large system") if point else ("correction", "total")
-    title = "Averages of a large system, ± 95 %, and the parts of their errors"
-    title += " in %" if point else " in %: median (largest)"
+    if point:
+        title = "Averages of a large system, ± 95 %, and the parts of their errors in %"
+    else:
+        title = (
+            "Averages of a large system: correction for N, and half-widths of 95 % intervals by "
+            "source, in %: median (largest)"
+        )
     if not _are_measured(data):
-        title += f"\n{data.pressure_large_system.attrs['comment']}"
+        _, _, flows = data.pressure_large_system.attrs["comment"].partition("measured ")
+        title += f"\nExtrapolated: the corrections were measured {flows} only"
     rows = []
     for name, words in _PRINTED.items():
         errors = relative_ci95(data, name)

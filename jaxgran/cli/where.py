@@ -17,10 +17,10 @@ from jaxgran.reference.table import MEASURED, THEORIES, shipped_table
 from jaxgran.reference.validity import COLUMNS, Validity, validity
 
 WHERE_EXAMPLES = {
-    "Does kinetic theory hold at a restitution and a packing fraction": "jaxgran where "
+    "Error of kinetic theory at a restitution and a packing fraction": "jaxgran where "
     "--restitution 0.5 --packing-fraction 0.7",
-    "And which of its assumptions fails": "jaxgran where --restitution 0.5 --packing-fraction 0.7 "
-    "--factors",
+    "And how far each of its assumptions is off": "jaxgran where --restitution 0.5 "
+    "--packing-fraction 0.7 --factors",
     "Every pair of two lists, as a table": "jaxgran where --restitution 0.2,0.5,0.8 "
     "--packing-fraction 0.5:0.8:4",
     "The constitutive law over the whole range": "jaxgran where --law law.csv",
@@ -104,7 +104,8 @@ def _print_point(flow: Validity, factors: bool, corrected: bool) -> None:
     about = f"{pair}; ± 95 %; units of m, σ and 1/γ̇"
     print_table(about, COLUMNS[:columns], (row[:columns] for row in flow.rows()))
     if factors:
-        rows = zip(_ASSUMPTIONS.values(), _factors(flow, with_error), strict=True)
+        rows = [*zip(_ASSUMPTIONS.values(), _factors(flow, with_error), strict=True)]
+        rows.append(("all of these", f"{np.prod([*flow.factors.values()]):#.3g}"))
         print_table(_FACTORS, ("assumed", "factor if measured instead"), rows)
     _print_source()
 

@@ -15,6 +15,7 @@ from jaxgran.maps.replica import Advance, Key
 from jaxgran.maps.settings import MapSettings
 
 _SECONDS_BETWEEN_LINES = 10  # without a terminal
+_LEAST_DONE = 0.01  # share of the work before which compilation is most of the time
 _MOST_STARTED = 0.95  # largest share that counts as done before a replica is finished
 
 
@@ -94,9 +95,10 @@ class Meter:
         seconds, done = time.perf_counter() - self.start, self._cost_of_run
         points = sum(seeds == 0 for seeds in self.left.values())
         percent = 100 * (self.resumed_cost + done) / self.total
+        whole = self.total - self.resumed_cost
         time_left = (
-            duration(seconds * max(self.total - self.resumed_cost - done, 0.0) / done)
-            if done > 0
+            duration(seconds * max(whole - done, 0.0) / done)
+            if done > _LEAST_DONE * whole
             else "unknown time"
         )
         speed = f"{self.done_steps / seconds:.3g} replica-steps/s"

@@ -103,7 +103,7 @@ class MapSettings:
         None,
         "Projected method of the contact solve.",
         get_args(SolverName),
-        default="barzilai-borwein",
+        default="barzilai-borwein; on a CPU after gauss-seidel",
     )
     activation: Activation = option(
         "midpoint", "When a pair of grains is a contact.", get_args(Activation)

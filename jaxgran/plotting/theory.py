@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jaxgran.maps.schema import RATIO, MapData, what_lacks
+from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.plotting.plane import (
     BINARY_EXCESS,
     Legend,
@@ -58,7 +59,9 @@ SHARE_LEVELS = {f"{level:.2f}": level for level in (0.05, 0.10, 0.25, 0.50, 0.75
 
 _QUANTITIES = {"pressure": "pressure", "shear_stress": "shear stress"}
 _MEASURED = (*_QUANTITIES, "stress_ratio")
+_LARGE = tuple(f"{name}_large_system{end}" for name in _QUANTITIES for end in ("", "_ci95"))
 _THEORY = (
+    *_LARGE,
     *(f"theory/{name}" for name in _QUANTITIES),
     *("stresses/kinetic_stress", "stresses/binary_stress"),
     *(f"{name}_stderr" for name in _MEASURED),
@@ -84,13 +87,13 @@ def has_clusters(data: xr.Dataset) -> bool:
 
 
 def error_parts(data: xr.Dataset, quantity: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return the error of the theory in `pressure` or `shear_stress`, the part of it that the
-    binary assumption has, and their standard errors.
+    """Return the error of the theory in `pressure` or `shear_stress` of a large system, the part of
+    it that the binary assumption has, and their standard errors.
 
     ========== ============================ ========================================================
     name       value                        source of the standard error
     ========== ============================ ========================================================
-    total      ln(theory/measured)          measured stress
+    total      ln(theory/large system)      total error of the stress of a large system
     binary     ln(binary/measured)          measured ratio of contact to binary stress
     ========== ============================ ========================================================
 
@@ -102,9 +105,11 @@ def error_parts(data: xr.Dataset, quantity: str) -> dict[str, tuple[np.ndarray, 
     def part_of(tensor: xr.DataArray) -> np.ndarray:
         return np.mean([tensor.isel(axis_a=a, axis_b=b).values for a, b in components], axis=0)
 
-    measured, theory, stderr = (
-        data[name].values for name in (quantity, f"theory/{quantity}", f"{quantity}_stderr")
+    large = f"{quantity}_large_system"
+    measured, theory, limit = (
+        data[name].values for name in (quantity, f"theory/{quantity}", large)
     )
+    stderr = data[f"{large}_ci95"].sel(error_source="total").values / HALF_INTERVAL
     sign = 1 if quantity == "pressure" else -1
     kinetic, collisional = (
         sign * part_of(data[f"stresses/{name}_stress"]) for name in ("kinetic", "binary")
@@ -113,7 +118,7 @@ def error_parts(data: xr.Dataset, quantity: str) -> dict[str, tuple[np.ndarray, 
     binary = kinetic + collisional
     with np.errstate(divide="ignore", invalid="ignore"):
         parts = {
-            "total": (np.log(theory / measured), stderr / measured),
+            "total": (np.log(theory / limit), stderr / limit),
             "binary": (np.log(binary / measured), collisional / binary * ratio_error),
         }
     return {
@@ -161,8 +166,8 @@ def theory_errors(data: MapData) -> Figure:
         data,
         f"Kinetic theory misses the pressure by more than 10 % at {wrong.sum()} of {wrong.size} "
         f"points, {binary.sum()} of which have a force ratio below {1 + BINARY_EXCESS:g}",
-        "Left: theory over measurement. Right: the measured flow with all collisions taken as "
-        "binary, over measurement",
+        "Left: theory over the stress of a large system, with its total error. Right: the measured "
+        "flow with all collisions taken as binary, over measurement",
     )
     return figure
 

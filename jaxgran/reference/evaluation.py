@@ -116,8 +116,10 @@ def _checked(name: str, value: Any, low: float, high: float) -> np.ndarray:
         numbers = np.asarray(value, float)
     except (TypeError, ValueError):
         numbers = np.array(np.nan)
-    if numbers.size == 0 or not np.all((low <= numbers) & (numbers <= high)):
+    within = (low <= numbers) & (numbers <= high)
+    if numbers.size == 0 or not np.all(within):
+        wrong = numbers[~within].flat[0] if np.isfinite(numbers).any() else value
         raise refused(
-            name, value, f"must be between {low:g} and {high:g}, the range of the reference map"
+            name, wrong, f"must be between {low:g} and {high:g}, the range of the reference map"
         )
     return numbers

@@ -23,7 +23,7 @@ from jaxgran.reference.table import (
     theory_of,
 )
 
-COLUMNS = ("average", "measured", "kinetic theory", "error", "error if corrected")
+COLUMNS = ("average", "measured", "theory", "error", "error if corrected")
 """What ``Validity.rows`` gives of every average."""
 
 _NEGLIGIBLE = 0.02  # a factor of the contact pressure this close to one is not said to fail
@@ -142,34 +142,37 @@ class Validity(NamedTuple):
 
     def _sentence(self) -> str:
         """The verdict on one flow."""
+        pressure, of_temperature = map(self._departure, ("pressure", "local_granular_temperature"))
+        same = pressure[0] == of_temperature[0]
+        start = (
+            f"Kinetic theory {pressure[0]} the pressure{pressure[1]} and "
+            f"{'' if same else of_temperature[0] + ' '}the local temperature{of_temperature[1]}"
+        )
+        product = float(np.prod([float(self.factors[name]) for name in FACTORS]))
         first = self.fails_first()
-        error, ci95 = (100 * float(x["pressure"]) for x in (self.error, self.error_ci95))
-        if abs(error) > ci95:
-            side = "over" if error > 0 else "under"
-            start = (
-                f"Kinetic theory {side}estimates the pressure by {with_error(abs(error), ci95)} %"
-            )
-        else:
-            start = (
-                "Kinetic theory agrees with the measured pressure (error "
-                f"{with_error(error, ci95)} %)"
-            )
         if first == "none":
-            cause = "; no assumption changes the contact pressure by more than 2 %"
+            where = "every assumption holds within 2 %"
         else:
             factor = float(self.factors[first])
-            why = f"a factor of {factor:.3g} in the contact pressure at the measured temperature"
-            cause = (
-                "; the largest departure from Enskog's assumptions: "
-                f"{_CAUSES[first][factor > 1]} ({why})"
-            )
+            where = f"{_CAUSES[first][factor > 1]} (a factor of {factor:.3g})"
         ratio, ratio_ci95 = (float(x["force_ratio"]) for x in (self.measured, self.measured_ci95))
         off = max(ratio - 1, 0.0) + ratio_ci95
         if off < 0.05:
-            binary = f"collisions are binary to {100 * off:.1g} %"
+            binary = f"the mean contact force is binary within {100 * off:.1g} %"
         else:
             binary = f"binary collisions explain {100 / ratio:.2g} % of the mean contact force"
-        return f"{start}{cause}; {binary} (dt = {shipped_table().timestep}/γ̇)."
+        return (
+            f"{start}; the contact pressure is {product:#.3g} times Enskog's at the measured "
+            f"temperature, where {where}; {binary} (dt = {shipped_table().timestep}/γ̇)."
+        )
+
+    def _departure(self, name: str) -> tuple[str, str]:
+        """What the theory does with an average: a verb, and by how much."""
+        error, ci95 = (100 * float(x[name]) for x in (self.error, self.error_ci95))
+        if abs(error) <= ci95:
+            return "agrees with", f" (error {with_error(error, ci95)} %)"
+        side = "over" if error > 0 else "under"
+        return f"{side}estimates", f" by {with_error(abs(error), ci95)} %"
 
 
 def validity(restitution: Any, packing_fraction: Any) -> Validity:
