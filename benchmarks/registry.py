@@ -142,7 +142,7 @@ BENCHMARKS = (
     Benchmark(
         "contact_duration",
         "Is a time step a duration of contact of event-driven discs?",
-        (19, 1),
+        (2, 1),
         ("contact_duration.json", "contact_duration.png"),
     ),
     Benchmark(
@@ -156,7 +156,7 @@ BENCHMARKS = (
     Benchmark(
         "scaling",
         "How do time and memory grow with the number of grains, and time with the time step?",
-        (4, 1.5),
+        (12, 2),
         ("scaling.json", "scaling.png"),
         (Option("--grains", "one flow of so many grains, printed as JSON", int),),
     ),
@@ -207,7 +207,7 @@ BENCHMARKS = (
     Benchmark(
         "timestep_study",
         "What becomes of the force ratio as the time step vanishes?",
-        (23, 1),
+        (4, 1),
         ("timestep_study.json", "timestep_study.png"),
         one_core=True,
     ),
