@@ -9,7 +9,7 @@ share of the contact pressure that jaxgran's clusters have. If dt were a duratio
 answers would be c dt with one c for all dt and flows. Between 1e-6 and 1e-3 each curve is also
 fitted by a power of its time.
 
-    python -m benchmarks contact_duration           # 19 minutes on two cores
+    python -m benchmarks contact_duration           # 2 minutes on two cores
     python -m benchmarks contact_duration --quick   # one flow of 64 grains, under a minute
 """
 

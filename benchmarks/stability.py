@@ -63,7 +63,7 @@ OUTCOMES = {  # mildest first, with the word in a cell
     "too_slow": "too slow",
     "too_soft": "too soft",
     "silent": "silent",  # wrong, and no status says so
-    "iteration_limit": "tolerance",  # solves end above it
+    "iteration_limit": "unsolved",  # solves end above the tolerance
     "deep_overlap": "overlaps",
     "infeasible": "jammed",  # no impulses exist
     "energy_gain": "energy",  # is gained
@@ -381,8 +381,9 @@ def draw(rows: list[dict]) -> Figure:
     axes.spines[:].set_visible(False)
     axes.set_xlabel(
         r"numbers: $\mathrm{d}t$ in $1/\dot\gamma$; of soft discs $k$ in $m\dot\gamma^2$; "
-        "darker: coarser; *: largest overlap above 0.01 σ\n"
-        "tolerance: solves end above it; –: runs, with nothing to compare (rigid discs are jammed)",
+        "darker: a coarser one suffices; *: largest overlap above 0.01 σ\n"
+        "unsolved: solves end above the tolerance; "
+        "–: runs, with nothing to compare (rigid discs are jammed)",
         fontsize=SMALL_SIZE,
     )
     return figure

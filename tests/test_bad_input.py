@@ -372,8 +372,8 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "is the last one of a series": lambda: jg.fields_at(SEVERAL, POINT, 1.0),
     "positive and at most 0.456 in this cell": lambda: jg.fields_at(SEEN, POINT, 1e308),
     "it has no packing_fraction, restitution, force_": lambda: jg.ratio_curves(xr.Dataset()),
-    "it has no pressure, shear_stress, stress_ratio, pressure_large_system": lambda: jg.theory_errors(
-        ratio_dataset()
+    "it has no pressure, shear_stress, stress_ratio, pressure_large_system": lambda: (
+        jg.theory_errors(ratio_dataset())
     ),
     "has 5 and 1": lambda: jg.ratio_contours(ratio_dataset(5, 1)),
     "at least two time steps, and this map has 1": lambda: jg.ratio_against_timestep(

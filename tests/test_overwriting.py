@@ -139,8 +139,8 @@ def test_a_new_map_replaces_no_file_by_a_figure(
     outcome = jaxgran(tmp_path, *words, "--output", "ratio.nc")
     assert_one_sentence(outcome)
     assert (
-        "the figure 'ratio_theory.png' already exists; pass --overwrite to replace it"
-        in outcome.err
+        "the figure 'ratio_theory.png' already exists; name another output, or pass "
+        "--overwrite to replace it" in outcome.err
     )
     assert files(tmp_path) == before and (tmp_path / "ratio_theory.png").read_bytes() == b"by hand"
     assert jaxgran(tmp_path, *words, "--output", "ratio.nc", "--overwrite").status == 0

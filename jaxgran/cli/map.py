@@ -22,7 +22,7 @@ from jaxgran.cli.output import JSON, print_json, print_table
 from jaxgran.cli.terminal import say_cache, say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, refused, short_repr
-from jaxgran.model.choices import FileFormat
+from jaxgran.model.choices import HALF_INTERVAL, FileFormat
 from jaxgran.model.display import in_brackets
 
 MAP_EXAMPLES = {
@@ -99,8 +99,8 @@ def require_new_figures(output: Path, format: FileFormat) -> None:
 
         for name in sorted({f"{output.stem}_{figure}.{format}" for figure in FIGURES} & {*names}):
             raise InputError(
-                f"the figure {short_repr(str(output.with_name(name)))} already exists; pass "
-                "`overwrite=True` to replace it.",
+                f"the figure {short_repr(str(output.with_name(name)))} already exists; name "
+                "another output, or pass `overwrite=True` to replace it.",
                 field="output",
             )
 
@@ -135,11 +135,11 @@ def print_tables(data) -> None:
                 f"{size}dt = {part.attrs['timestep']:g} / shear rate, {part.attrs['activation']} "
                 "activation"
             )
+            half = HALF_INTERVAL * part.force_ratio_stderr
             title = f"Force ratio by packing fraction ν and restitution α: {about}"
-            brackets = "In brackets: standard error"
-            _print_plane(part, part.force_ratio, part.force_ratio_stderr, f"{title}. {brackets}")
+            _print_plane(part, part.force_ratio, half, title)
             half = part.pressure_large_system_ci95.sel(error_source="total")
-            title = f"Pressure of a large system in m/t²: {about}. In brackets: 95 % half-width"
+            title = f"Pressure of a large system in m/t²: {about}"
             _print_plane(part, part.pressure_large_system, half, title)
     print_large_system(data)
 
@@ -169,16 +169,16 @@ map_command = command(MAP_OPTIONS, run_map_command)
 plot_command = command(PLOT_OPTIONS, run_plot_command, argument=FILE)
 
 
-def _print_plane(data, values, errors, title: str) -> None:
-    """An average of a map with its errors in brackets; * marks a bad status."""
+def _print_plane(data, values, halves, title: str) -> None:
+    """An average of a map with half-widths of 95 % intervals in brackets; * marks a bad status."""
     rows = []
     for nu in data.packing_fraction.values:
-        line = (x.sel(packing_fraction=nu).values for x in (values, errors, data.status))
+        line = (x.sel(packing_fraction=nu).values for x in (values, halves, data.status))
         cells = [
-            (in_brackets(value, error) if math.isfinite(value) else "no value")
-            + " *" * bool(status)
-            for value, error, status in zip(*line, strict=True)
+            (in_brackets(value, half) if math.isfinite(value) else "no value") + " *" * bool(status)
+            for value, half, status in zip(*line, strict=True)
         ]
         rows.append([f"{nu:g}", *cells])
     columns = ["ν", *(f"α = {x:g}" for x in data.restitution.values)]
-    print_table(f"{title} of the last digits. *: bad status.", columns, rows)
+    about = "In brackets: 95 % half-width of the last digits. *: bad status."
+    print_table(f"{title}. {about}", columns, rows)

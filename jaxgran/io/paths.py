@@ -40,7 +40,7 @@ def require_absent(path: Path, option: str) -> None:
     """Raise an InputError if there is a file that would be replaced."""
     if os.path.isfile(path):
         raise InputError(
-            f"{option} {short_repr(str(path))} already exists; pass `overwrite=True` to replace "
-            "it.",
+            f"{option} {short_repr(str(path))} already exists; name another file, or pass "
+            "`overwrite=True` to replace it.",
             field=option,
         )

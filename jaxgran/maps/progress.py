@@ -102,7 +102,8 @@ class Meter:
             else "unknown time"
         )
         speed = f"{self.done_steps / seconds:.3g} replica-steps/s"
-        return f"{points}/{len(self.left)} points, {percent:.0f} % done, {speed}, {time_left} left"
+        done_points = f"{points}/{len(self.left)} points"
+        return f"{percent:.0f} % of the work done, {done_points}, {speed}, {time_left} left"
 
 
 @contextmanager

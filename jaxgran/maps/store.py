@@ -70,7 +70,7 @@ def open_store(settings: MapSettings, run: RunOptions) -> Iterator[Store]:
     if difference and not (run.overwrite or continued):
         raise InputError(
             f"output {short_repr(str(run.output))} already exists and has {difference}; "
-            "pass `overwrite=True` to replace it.",
+            "name another file, or pass `overwrite=True` to replace it.",
             field="output",
         )
     checkpoint = Checkpoint(run.output, settings, run.resume)

@@ -121,7 +121,8 @@ def enskog_factors(data: MapData) -> Figure:
     describe(
         figure,
         data,
-        f"The theory's contact pressure is right within 10 % at {whole} of {logs[0].size} points, "
+        f"At this $N$ the theory's contact pressure is right within 10 % at {whole} of "
+        f"{logs[0].size} points, "
         f"Enskog's at the measured temperature at {enskog}, each of its assumptions at {all_right}"
         f"{': errors cancel' if enskog > all_right else ''}",
         "Each factor replaces one more assumption by what is measured; thick: their product",

@@ -126,9 +126,9 @@ class Validity(NamedTuple):
         rows = []
         for name, measured in self.measured.items():
             predicted = self.theory.get(name.removeprefix("local_"))
-            theory = "" if predicted is None else f"{predicted:.4g}"
-            errors = ["", ""]
+            theory, errors = "", ["", ""]
             if name in self.error:
+                theory = f"{predicted:.4g}"
                 of_theories = (
                     (self.error[name], self.error_ci95[name]),
                     (self.corrected_error[name], self.corrected_error_ci95[name]),
@@ -149,21 +149,30 @@ class Validity(NamedTuple):
             f"{'' if same else of_temperature[0] + ' '}the local temperature{of_temperature[1]}"
         )
         product = float(np.prod([float(self.factors[name]) for name in FACTORS]))
+        missing = 100 * (1 / product - 1)
+        enskog = f"{abs(missing):.2g} % too {'high' if missing > 0 else 'low'}"
+        enskog = enskog if abs(missing) >= 0.5 else "right"
         first = self.fails_first()
         if first == "none":
-            where = "every assumption holds within 2 %"
+            cause = "each of its assumptions holds within 2 %"
         else:
             factor = float(self.factors[first])
-            where = f"{_CAUSES[first][factor > 1]} (a factor of {factor:.3g})"
+            cause = (
+                f"furthest from its assumptions, {_CAUSES[first][factor > 1]} (a factor of "
+                f"{factor:.3g})"
+            )
         ratio, ratio_ci95 = (float(x["force_ratio"]) for x in (self.measured, self.measured_ci95))
         off = max(ratio - 1, 0.0) + ratio_ci95
+        step = f"dt = {shipped_table().timestep}/γ̇"
         if off < 0.05:
-            binary = f"the mean contact force is binary within {100 * off:.1g} %"
+            most = 1 + float(f"{off:.1g}")
+            binary = f"collisions are binary (force ratio at most {most:g}, {step})"
         else:
-            binary = f"binary collisions explain {100 / ratio:.2g} % of the mean contact force"
+            explained = f"{100 / ratio:.2g} % of the mean contact force"
+            binary = f"binary collisions explain {explained} ({step})"
         return (
-            f"{start}; the contact pressure is {product:#.3g} times Enskog's at the measured "
-            f"temperature, where {where}; {binary} (dt = {shipped_table().timestep}/γ̇)."
+            f"{start}; given the measured temperature, Enskog's contact pressure would be "
+            f"{enskog}; {cause}; {binary}."
         )
 
     def _departure(self, name: str) -> tuple[str, str]:
