@@ -43,6 +43,7 @@ from jaxgran.maps.results import open_map, write_dataset
 from jaxgran.maps.schema import flattened, path_of
 from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.start import combined
+from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import in_brackets, with_error
 from jaxgran.model.status import Status
 from jaxgran.plotting.map_figures import FIGURES
@@ -199,8 +200,13 @@ def small_data(small_map) -> xr.DataTree:
 
 def test_map_prints_the_tables_and_the_progress_apart(small_map, small_data) -> None:
     (_, (_, out, err)), data = small_map, small_data
-    ratios = zip(data.force_ratio.values.flat, data.force_ratio_stderr.values.flat, strict=True)
-    assert all(in_brackets(float(x), float(dx)) in out for x, dx in ratios)
+    pressure = data.pressure_large_system_ci95.sel(error_source="total")
+    for values, halves in (
+        (data.force_ratio, HALF_INTERVAL * data.force_ratio_stderr),
+        (data.pressure_large_system, pressure),
+    ):
+        pairs = zip(values.values.flat, halves.values.flat, strict=True)
+        assert all(in_brackets(float(x), float(half)) in out for x, half in pairs)
     assert "large system" in out
     assert "points" not in out and "4/4 points" in err and "wrote small.nc" in err
 

@@ -154,7 +154,10 @@ def test_a_page_replaces_no_file(finished: bytes, tmp_path: Path) -> None:
     page.write_bytes(b"notes")
     outcome = jaxgran(tmp_path, "explore", "jaxgran_map.nc")
     assert_one_sentence(outcome)
-    assert "--output 'jaxgran_map.html' already exists; pass --overwrite" in outcome.err
+    assert (
+        "--output 'jaxgran_map.html' already exists; name another file, or pass --overwrite"
+        in outcome.err
+    )
     assert page.read_bytes() == b"notes"
     assert jaxgran(tmp_path, "explore", "jaxgran_map.nc", "--overwrite").status == 0
     assert page.read_bytes() != b"notes"
@@ -179,5 +182,8 @@ def test_frames_are_not_replaced(option: str, tmp_path: Path) -> None:
     file.write_bytes(b"frames")
     outcome = jaxgran(tmp_path, *RUN, f"--{option}", file.name)
     assert_one_sentence(outcome)
-    assert f"--{option} {file.name!r} already exists; pass --overwrite" in outcome.err
+    assert (
+        f"--{option} {file.name!r} already exists; name another file, or pass --overwrite"
+        in outcome.err
+    )
     assert files(tmp_path) == {file.name}

@@ -279,7 +279,7 @@ def test_the_command_writes_the_law_of_python_and_replaces_no_file(tmp_path: Pat
     outcome = jaxgran(tmp_path, *words)
     assert outcome == (0, "", "wrote shell.csv\n")
     assert (tmp_path / "shell.csv").read_bytes() == (tmp_path / "python.csv").read_bytes()
-    assert "already exists; pass --overwrite" in jaxgran(tmp_path, *words).err
+    assert "name another file, or pass --overwrite" in jaxgran(tmp_path, *words).err
     assert jaxgran(tmp_path, *words, "--overwrite").status == 0
 
 
