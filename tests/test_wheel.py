@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from jaxgran.maps.results import open_map
+from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import in_brackets
 
 pytestmark = [
@@ -135,7 +136,8 @@ def test_a_user_without_rights_home_and_cache_gets_a_table(place: Path, anyone, 
     rows = [line for line in out.splitlines() if line.startswith("| 0.7 ")]
     assert rows and all("(" in row for row in rows)
     there = data.sel(packing_fraction=0.7)
-    for numbers in zip(there.force_ratio.values, there.force_ratio_stderr.values, strict=True):
+    halves = HALF_INTERVAL * there.force_ratio_stderr.values
+    for numbers in zip(there.force_ratio.values, halves, strict=True):
         assert any(in_brackets(*numbers) in row for row in rows)
     assert {path.suffix for path in folder.iterdir()} >= {".nc", ".png"} and not list(
         shared.iterdir()
