@@ -50,7 +50,7 @@ def run(output: Output) -> None:
     for (replicas, grains, dt), (alpha, nu) in product(batches, points):
         flow = jg.ShearFlow(grains=grains, restitution=alpha, packing_fraction=nu, timestep=dt)
         about = {"replicas": replicas, "grains": grains, "dt": dt, "alpha": alpha, "nu": nu}
-        rows.append(about | compare(flow, dt, replicas))
+        rows.append(about | compare(flow, replicas))
         print(
             "{replicas:8d}{grains:8d}{dt:7.0e}{alpha:6.2g}{nu:6.2g}{device:8.2g}{rival:23.2g}"
             "{ratio:7.2g}{pressure:10.5f}{compilation:13.1f}".format(**rows[-1]),
@@ -62,16 +62,16 @@ def run(output: Output) -> None:
         )
 
 
-def compare(flow: jg.ShearFlow, dt: float, replicas: int) -> dict:
+def compare(flow: jg.ShearFlow, replicas: int) -> dict:
     """Replica-steps per second from the same states, the fastest of some calls in turn, and the
     mean pressure of the device over that of the processor.
     """
-    steps = round(STRAIN / dt)
+    steps, apart = (round(strain / float(flow.timestep)) for strain in (STRAIN, APART))
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         state = jg.prepare(flow, jax.random.key(0), equilibrate=5.0)
         forward = jax.jit(jg.advance)
         distinct = [
-            state := forward(flow, state, jnp.int32(round(APART / dt)))[0]
+            state := forward(flow, state, jnp.int32(apart))[0]
             for _ in range(min(DISTINCT, replicas))
         ]
         tallies = [forward(flow, one, jnp.int32(steps))[1] for one in distinct]

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 import jaxgran as jg
-from benchmarks.output import Output
+from benchmarks.output import Output, rounded
 from jaxgran.environment import usable_cores
 from jaxgran.maps.schema import flattened
 
@@ -25,8 +25,6 @@ AVERAGES = {
     "shear_stress": "theory/shear_stress",
     "local_granular_temperature": "theory/granular_temperature",
 }
-
-
 TIMESTEP = 3e-5  # no deep overlaps at any point
 
 
@@ -57,7 +55,7 @@ def rows_of_size(plan: Plan, grains: int) -> list[dict]:
     """A row for each flow of so many grains: status, and averages over theory less one with their
     standard errors.
     """
-    found = jg.ratio_map(
+    measured = jg.ratio_map(
         restitution=plan.restitutions,
         packing_fraction=plan.packing_fractions,
         grains=grains,
@@ -66,8 +64,7 @@ def rows_of_size(plan: Plan, grains: int) -> list[dict]:
         workers=usable_cores(),
         strain=plan.strain / np.sqrt(grains),
     )
-    data = flattened(found)
-    rows = []
+    data, rows = flattened(measured), []
     for alpha, nu in product(plan.restitutions, plan.packing_fractions):
         point = data.sel(restitution=alpha, packing_fraction=nu)
         row = {
@@ -77,10 +74,8 @@ def rows_of_size(plan: Plan, grains: int) -> list[dict]:
             "status": jg.Status(int(point.status)).name,
         }
         for name, theory in AVERAGES.items():
-            row[name] = [
-                float(f"{x:.4g}")
-                for x in (point[name] / point[theory] - 1, point[f"{name}_stderr"] / point[theory])
-            ]
+            over_theory = point[name] / point[theory] - 1, point[f"{name}_stderr"] / point[theory]
+            row[name] = rounded([float(x) for x in over_theory], 4)
         print(", ".join(f"{name} {value}" for name, value in row.items()), flush=True)
         rows.append(row)
     return rows

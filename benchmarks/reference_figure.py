@@ -11,6 +11,7 @@ from matplotlib.patches import Patch
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.plotting.style import (
     ALPHA_LABEL,
+    INTERVAL_COLOUR,
     NU_LABEL,
     ONE_COLUMN,
     SMALL_SIZE,
@@ -53,7 +54,7 @@ def draw(table: Table) -> Figure:
     handles = [
         Patch(facecolor="0.88", label="theory within 10 %"),
         Line2D([], [], color="black", linewidth=0.9, label="error of the pressure"),
-        Patch(facecolor="#f6d5a4", label="its 95 % interval"),
+        Patch(facecolor=INTERVAL_COLOUR, label="its 95 % interval"),
         Line2D([], [], color=GREEN, linewidth=2, label=rf"force ratio 1.05, d$t={between}$"),
         Patch(facecolor=GREEN, alpha=0.25, label=rf"the same, ${first}$ to ${last}$"),
     ]
@@ -70,7 +71,7 @@ def _draw_errors(axes: Axes, table: Table, x: np.ndarray, y: np.ndarray, where: 
     error = np.expm1(-over)
     axes.contourf(x, y, abs(error), [0, RIGHT], colors=["0.88"], zorder=0)
     apart = np.min([np.abs(np.log1p(level) + over) for level in LEVELS], axis=0)
-    axes.contourf(x, y, apart - half, [-9, 0], colors=["#f6d5a4"], zorder=1)
+    axes.contourf(x, y, apart - half, [-9, 0], colors=[INTERVAL_COLOUR], zorder=1)
     lines = axes.contour(
         x, y, error, LEVELS, colors="black", linestyles="-", linewidths=0.9, zorder=2
     )

@@ -156,7 +156,7 @@ BENCHMARKS = (
     Benchmark(
         "scaling",
         "How do time and memory grow with the number of grains, and time with the time step?",
-        (12, 2),
+        (7, 2),
         ("scaling.json", "scaling.png"),
         (Option("--grains", "one flow of so many grains, printed as JSON", int),),
     ),

@@ -5,7 +5,7 @@ Every size of a flow is measured in its own process, with its peak resident memo
 time, which does not count what else runs on a machine. The exponent of each growth is a
 least-squares fit to the logarithms.
 
-    python -m benchmarks scaling           # up to 1e6 grains; 12 minutes
+    python -m benchmarks scaling           # up to 1e6 grains; 7 minutes
     python -m benchmarks scaling --quick   # up to 1e4 grains; most of it compilation
     python -m benchmarks scaling --grains 100000   # one flow, for a strain of 0.1, as JSON
 """

@@ -9,6 +9,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from benchmarks.peers.front import COST, rows_of
 from jaxgran.plotting.style import (
+    INTERVAL_COLOUR,
     LABEL_SIZE,
     SMALL_SIZE,
     TWO_COLUMNS,
@@ -61,7 +62,8 @@ def draw(result: dict) -> Figure:
     for axes, flow, letter in zip(panels, flows, "abc", strict=False):
         axes.set(xscale="log", yscale="log", ylim=(LEAST, MOST), xlim=TIMES)
         value, noise = flow["reference"]["pressure"]
-        axes.axhspan(LEAST, 2 * noise / value, color="#f6d5a4", alpha=0.6, zorder=0, lw=0)
+        shade = {"color": INTERVAL_COLOUR, "alpha": 0.6, "zorder": 0, "lw": 0}
+        axes.axhspan(LEAST, 2 * noise / value, **shade)
         for curve, look in LOOKS.items():
             _draw_curve(axes, flow, curve, look, look.places["abc".index(letter)])
         alpha, nu = flow["restitution"], flow["packing_fraction"]

@@ -201,6 +201,7 @@ def print_large_system(data) -> None:
 
 def _print_large_system(data) -> None:
     from jaxgran.maps.schema import relative_ci95
+    from jaxgran.maps.variables import MEASURED_FLOWS
 
     point = data.status.size == 1
     size = f"N = {data.attrs['grains']}" if "grains" in data.attrs else "its N"
@@ -213,8 +214,7 @@ def _print_large_system(data) -> None:
             "source, in %: median (largest)"
         )
     if not _are_measured(data):
-        _, _, flows = data.pressure_large_system.attrs["comment"].partition("measured ")
-        title += f"\nExtrapolated: the corrections were measured {flows} only"
+        title += f"\nExtrapolated: the corrections were measured at {MEASURED_FLOWS} only"
     rows = []
     for name, words in _PRINTED.items():
         errors = relative_ci95(data, name)

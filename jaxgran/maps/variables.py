@@ -24,9 +24,12 @@ _THEORY = "Enskog moments of an anisotropic Gaussian in each size class"
 _RANGES = ", ".join(
     f"{name.replace('_', ' ')} {low:g} to {high:g}" for name, (low, high) in MEASURED_RANGES.items()
 )
+MEASURED_FLOWS = f"polydispersity {MEASURED_POLYDISPERSITY:g}, {_RANGES}"
+"""Where the laws of a large system hold."""
+
 LAWS = (
     "corrected for the number of grains, with bounds of time step and tolerance, by laws measured "
-    f"at polydispersity {MEASURED_POLYDISPERSITY:g}, {_RANGES}"
+    f"at {MEASURED_FLOWS}"
 )
 """How the averages of a large system follow, and where the laws hold."""
 

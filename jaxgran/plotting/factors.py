@@ -122,9 +122,8 @@ def enskog_factors(data: MapData) -> Figure:
         figure,
         data,
         f"At this $N$ the theory's contact pressure is right within 10 % at {whole} of "
-        f"{logs[0].size} points, "
-        f"Enskog's at the measured temperature at {enskog}, each of its assumptions at {all_right}"
-        f"{': errors cancel' if enskog > all_right else ''}",
+        f"{logs[0].size} points, Enskog's at the measured temperature at {enskog}, each of its "
+        f"assumptions at {all_right}{': errors cancel' if enskog > all_right else ''}",
         "Each factor replaces one more assumption by what is measured; thick: their product",
     )
     return figure

@@ -64,6 +64,7 @@ ALPHA_TITLE = r"restitution $\alpha$"
 ALPHA_LABEL = r"$1-\alpha$"
 NU_LABEL = r"packing fraction $\nu$"
 RATIO_LABEL = r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$"
+INTERVAL_COLOUR = "#f6d5a4"  # of what lies within an error
 RING: dict[str, Any] = {
     "linestyle": "none",
     "marker": "o",
