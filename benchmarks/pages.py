@@ -31,6 +31,7 @@ from jaxgran.maps.schema import flattened, shear_stress_ratio
 from jaxgran.model.display import with_error
 from jaxgran.plotting.factors import CURVES, PREFIX, with_temperature
 from jaxgran.reference.table import FACTORS
+from jaxgran.reference.validity import validity
 
 BUILD = ROOT / "docs" / "_build"
 TEMPLATES = {  # of committed pages
@@ -174,18 +175,6 @@ def percent_pm(value_and_error: Iterable[float]) -> str:
     return pm(*(100 * x for x in value_and_error)) + " %"
 
 
-def over(one: Sequence[float], other: Sequence[float]) -> tuple[float, float]:
-    """By how much a value exceeds another, relative to the other, and its standard error; both with
-    their errors.
-
-    Examples:
-      >>> over((1.5, 0.03), (1.0, 0.0))
-      (0.5, 0.03)
-    """
-    quotient = one[0] / other[0]
-    return quotient - 1, quotient * math.hypot(one[1] / one[0], other[1] / other[0])
-
-
 def product_of(
     rows: Iterable[Mapping[str, Any]], timestep: float, flow: Sequence[float] = (0.2, 0.6)
 ) -> float:
@@ -254,7 +243,7 @@ ENVIRONMENT.globals |= {"SOLVER_GROUPS": GROUPS, "FACTOR_CURVES": CURVES}
 ENVIRONMENT.globals |= {
     one.__name__: one
     for one in (
-        *(max, at, point, quotients, over, ranked),
+        *(max, at, point, quotients, ranked, validity),
         *(sig, percent, percent_pm, pm, duration),
         *(factors, grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where, product_of),
     )

@@ -105,7 +105,7 @@ def _print_point(flow: Validity, factors: bool, corrected: bool) -> None:
     print_table(about, COLUMNS[:columns], (row[:columns] for row in flow.rows()))
     if factors:
         rows = [*zip(_ASSUMPTIONS.values(), _factors(flow, with_error), strict=True)]
-        rows.append(("all of these", f"{np.prod([*flow.factors.values()]):#.3g}"))
+        rows.append(("all of these", f"{float(flow.over_enskog()):#.3g}"))
         print_table(_FACTORS, ("assumed", "factor if measured instead"), rows)
     _print_source()
 

@@ -10,6 +10,7 @@ import xarray as xr
 from matplotlib.ticker import MaxNLocator
 
 from jaxgran.maps.schema import FINEST, TENSOR_AXES, path_of
+from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import unit_text, with_error
 from jaxgran.plotting.encoding import EXCESS_LEVELS
 from jaxgran.plotting.plane import contour_variable, interpolated, refined_axes
@@ -93,22 +94,31 @@ def _observable(
     value = column(data[name].isel(place), data)
     error = known(f"{name}_stderr")
     theory = known(f"theory/{label}") if path_of(label) == name else None
-    large = known(f"{name}_large_system")
+    large, half = known(f"{name}_large_system"), known(f"{name}_large_system_ci95")
     words = text_line(label + component).replace("_", " ")
     unit = unit_text(text_line(attrs.get("reduced_unit", attrs.get("units", ""))))
     title = f"{words} ({unit})" if unit else words
     lines = {"error": error, "theory": theory}
     views = [_view(data, title, value, lines, name == "excess")]
     if theory is not None:
+        # the theory is that of a large system
+        measured, of, stderr = (
+            (value, "", error)
+            if large is None or half is None
+            else (large, " of a large system", half / HALF_INTERVAL)
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
-            quotients = {part: x if x is None else x / theory for part, x in lines.items()}
-            quotient = value / theory
-        views.append(_view(data, f"{words} / kinetic theory", quotient, quotients, False))
+            quotient = measured / theory
+            quotients = {
+                "error": None if stderr is None else stderr / theory,
+                "theory": theory / theory,
+            }
+        views.append(_view(data, f"{words}{of} / kinetic theory", quotient, quotients, False))
     texts = [
         _texts(value, error),
         _texts(theory, digits=4),
         _texts(_effective_samples(data, label), digits=3),
-        _texts(large, known(f"{name}_large_system_ci95")),
+        _texts(large, half),
     ]
     meaning = text_line(attrs.get("long_name", label.replace("_", " "))) + component.replace(
         "_", ", "

@@ -6,6 +6,7 @@ the package (module ``table``), the prediction of the theory from a series. Both
 derivatives exist.
 """
 
+import math
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -96,6 +97,10 @@ class Validity(NamedTuple):
         failing = np.where(np.max(logs, axis=0) > _NEGLIGIBLE, names, "none")
         return failing if failing.ndim else str(failing)
 
+    def over_enskog(self) -> Any:
+        """The measured contact pressure over Enskog's at the measured granular temperature."""
+        return math.prod(self.factors[name] for name in FACTORS)
+
     def at(self, place: Any) -> "Validity":
         """One flow of an array of flows, or a part of them; for values that are known, not
         traced.
@@ -148,8 +153,7 @@ class Validity(NamedTuple):
             f"Kinetic theory {pressure[0]} the pressure{pressure[1]} and "
             f"{'' if same else of_temperature[0] + ' '}the local temperature{of_temperature[1]}"
         )
-        product = float(np.prod([float(self.factors[name]) for name in FACTORS]))
-        missing = 100 * (1 / product - 1)
+        missing = 100 * (1 / float(self.over_enskog()) - 1)
         enskog = f"{abs(missing):.2g} % too {'high' if missing > 0 else 'low'}"
         enskog = enskog if abs(missing) >= 0.5 else "right"
         first = self.fails_first()
