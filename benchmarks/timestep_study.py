@@ -44,15 +44,15 @@ advance = jax.jit(jg.advance)
 
 
 class Plan(NamedTuple):
-    """Restitutions and packing fractions of the flows, grains, seeds, sampled strain of each, and
-    the time steps.
+    """Restitutions and packing fractions of the flows, grains, seeds, the sampled strain of each at
+    every packing fraction, and the time steps.
     """
 
     restitution: tuple[float, ...]
     packing_fraction: tuple[float, ...]
     grains: int
     seeds: int
-    strain: float
+    strain: tuple[float, ...]
     timesteps: tuple[float, ...]
 
 
@@ -61,8 +61,8 @@ def half_decades(first: int, last: int) -> tuple[float, ...]:
     return tuple(float(f"{10 ** (first - k / 2):.3g}") for k in range(2 * (first - last) + 1))
 
 
-FULL = Plan((0.9, 0.5, 0.1), (0.6, 0.8), 256, 3, 4.0, half_decades(-2, -6))
-QUICK = Plan((0.5, 0.1), (0.6,), 64, 3, 1.0, half_decades(-2, -4))
+FULL = Plan((0.9, 0.5, 0.1), (0.6, 0.8), 256, 3, (25.0, 4.0), half_decades(-2, -6))
+QUICK = Plan((0.5, 0.1), (0.6,), 64, 3, (1.0,), half_decades(-2, -4))
 
 
 def run(output: Output) -> None:
@@ -108,14 +108,13 @@ def samples(plan: Plan, task: tuple[float, float, str, int]) -> dict[float, jg.S
     def flow(timestep: float) -> jg.ShearFlow:
         return jg.ShearFlow(plan.grains, alpha, nu, timestep, activation=rule)
 
-    steady = jg.prepare(
-        flow(START), jax.random.key(seed), equilibrate=max(5.0, 2 / (nu * (1 - alpha**2)))
-    )
+    strain = plan.strain[plan.packing_fraction.index(nu)]
+    steady = jg.prepare(flow(START), jax.random.key(seed))
     found, state = {}, steady
     for timestep in sorted(plan.timesteps, reverse=True):
         before = steady if timestep >= START else state
         relaxed, _ = advance(flow(timestep), before, jnp.int32(round(RELAXATION / timestep)))
-        state, sample = jg.sample(flow(timestep), relaxed, plan.strain)
+        state, sample = jg.sample(flow(timestep), relaxed, strain)
         found[timestep] = jax.tree.map(np.asarray, sample)
     return found
 
