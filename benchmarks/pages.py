@@ -12,6 +12,7 @@ are ``{=# … #=}``.
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -259,7 +260,41 @@ ENVIRONMENT.globals |= {
 
 def filled(page: str) -> str:
     """A page with its numbers."""
-    return ENVIRONMENT.from_string(page).render()
+    return wrapped(ENVIRONMENT.from_string(page).render())
+
+
+_CODE_OR_GAP = re.compile(r"(^```.*?^```$|\n{2,})", re.MULTILINE | re.DOTALL)
+_LEFT = re.compile(r"\A(---|```|[|#><$!{:\d\s])|^(\||:::)|(  |\\)$", re.MULTILINE)
+_LISTED = re.compile(r"^\s*([-+*]|\d+[.)]|#+)\s", re.MULTILINE)
+
+
+def wrapped(page: str) -> str:
+    """A page whose paragraphs and lists have lines of at most 100 characters. Tables, pictures,
+    formulas, headings, code and HTML are left as they are.
+
+    Examples:
+      >>> print(wrapped("Two\\nlines.\\n\\n- an\\n  item\\n- `a b`"))
+      Two lines.
+      <BLANKLINE>
+      - an item
+      - `a b`
+    """
+    return "".join(
+        part if _LEFT.search(part) else _wrapped_part(part) for part in _CODE_OR_GAP.split(page)
+    )
+
+
+def _wrapped_part(part: str) -> str:
+    """A paragraph or a list; as it is where a line would begin like an item of a list."""
+    solid = re.sub(r"`[^`]*`", lambda code: re.sub(r"\s", "\0", code[0]), part)
+    items = re.split(r"\n(?=- )", solid)
+    settings: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
+    text = "\n".join(
+        textwrap.fill(item, 100, subsequent_indent="  " * item.startswith("- "), **settings)
+        for item in (" ".join(item.split()) for item in items)
+    ).replace("\0", " ")
+    is_same = len(_LISTED.findall(text)) == sum(item.startswith("- ") for item in items)
+    return text if is_same else part
 
 
 if __name__ == "__main__":
