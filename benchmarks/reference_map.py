@@ -2,7 +2,9 @@
 at dt = 1e-4.
 
 Packing fractions are 0.01 apart where averages change fast, and restitutions are close where grains
-cluster. Loose flows depend on N and have 6400 grains, dense ones 1600. Every seed is a map of its
+cluster. Loose flows depend on N and have 6400 grains, dense ones 1600, and in between, where 1600
+are too few for long waves, another map has 6400 (``--part between``), whose points take the place
+of those of 1600 (``reference_points``). Every seed is a map of its
 own, sampled over six correlation strains of each flow, and kept beside the results; all are merged.
 So a run that was stopped goes on, and another seed makes all errors smaller. Flows of several sizes
 say how averages approach those of a large system (``python -m benchmarks size_limits``), and a map
@@ -10,6 +12,7 @@ at dt = 1e-3 what becomes of the force ratio.
 
     python -m benchmarks reference_map               # two hours on two cores
     python -m benchmarks reference_map --seeds 4     # two seeds more
+    python -m benchmarks reference_map --part between  # ν = 0.72 to 0.77, 6400 grains, 75 minutes
     python -m benchmarks reference_map --part sizes  # flows of several sizes
     python -m benchmarks reference_map --part large  # one flow of 102,400 grains, half an hour
     python -m benchmarks reference_map --part check  # flows that no law was fitted to, 20 minutes
@@ -30,7 +33,8 @@ from jaxgran.maps.results import write_dataset
 KEPT = RESULTS / ".reference_map"  # the maps of single seeds
 RESTITUTIONS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
 LOOSE = (0.1, 0.2, 0.3, 0.4, 0.5, 0.56, 0.6, 0.65, 0.7)
-DENSE = (0.72, 0.73, 0.74, 0.75, 0.76, 0.77, 0.78, 0.79, 0.8, 0.81, 0.82, 0.83)
+BETWEEN = (0.72, 0.73, 0.74, 0.75, 0.76, 0.77)
+DENSE = (*BETWEEN, 0.78, 0.79, 0.8, 0.81, 0.82, 0.83)
 
 
 def plane(quick: bool) -> dict[str, Any]:
@@ -48,6 +52,15 @@ def plane(quick: bool) -> dict[str, Any]:
         "grains_by_point": grains,
         "timestep": 5e-4 if quick else 1e-4,
     }
+
+
+def between(quick: bool) -> dict[str, dict[str, Any]]:
+    """The arguments of ``ratio_map`` for flows of middle density with as many grains as loose
+    ones.
+    """
+    chosen = {"restitution": RESTITUTIONS, "packing_fraction": BETWEEN, "grains": 6400}
+    small = {"restitution": (0.1, 0.9), "packing_fraction": (0.72,), "grains": 100}
+    return {"between": (small if quick else chosen) | {"timestep": 5e-4 if quick else 1e-4}}
 
 
 def sizes(quick: bool) -> dict[str, dict[str, Any]]:
@@ -105,7 +118,7 @@ def coarse(quick: bool) -> dict[str, dict[str, Any]]:
     }
 
 
-PARTS = {"sizes": sizes, "large": large, "check": check, "coarse": coarse}
+PARTS = {"between": between, "sizes": sizes, "large": large, "check": check, "coarse": coarse}
 
 
 def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT) -> None:

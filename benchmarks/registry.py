@@ -87,7 +87,7 @@ BENCHMARKS = (
             *(
                 f"reference_{name}.nc"
                 for name in (
-                    *("sizes_loose", "sizes_dense", "large"),
+                    *("between", "sizes_loose", "sizes_dense", "large"),
                     *("check_small", "check_large", "coarse"),
                 )
             ),
@@ -96,9 +96,9 @@ BENCHMARKS = (
             Option("--seeds", "number of seeds, those that are kept included", int),
             Option(
                 "--part",
-                "the plane, flows of several sizes, a large one, flows that no law was fitted to, "
-                "or a coarse time step",
-                choices=("plane", "sizes", "large", "check", "coarse"),
+                "the plane, flows between loose and dense ones, flows of several sizes, a large one, "
+                "flows that no law was fitted to, or a coarse time step",
+                choices=("plane", "between", "sizes", "large", "check", "coarse"),
             ),
             Option("--folder", "where the maps that are done are kept", Path),
         ),
