@@ -24,9 +24,10 @@ from scipy.optimize import least_squares
 
 import jaxgran as jg
 from benchmarks.output import RESULTS, Output, rounded
+from benchmarks.reference_map import reference_points
 from jaxgran.environment import usable_cores
 from jaxgran.maps.presets import PRESETS
-from jaxgran.maps.schema import flattened
+from jaxgran.maps.schema import MapData, flattened
 from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, curve_styles, label_log_axis, styled
 from jaxgran.reference.corrected_shear import (
     MEASURED_LAWS,
@@ -82,17 +83,17 @@ Points = dict[str, np.ndarray]  # numbers of the points of a map, each (points,)
 
 def run(output: Output) -> None:
     """Compare, fit, judge, print, and write JSON and PNG."""
-    tree = jg.open_map(RESULTS / "reference.nc")
+    plane = reference_points()
     another = jg.ratio_map(**JUDGED | (SMALLER if output.quick else {}), workers=usable_cores())
-    maps = {"map": tree, "paper": jg.open_map(RESULTS / "paper.nc"), "judged_on": another}
+    maps = {"map": plane, "paper": jg.open_map(RESULTS / "paper.nc"), "judged_on": another}
     points, paper, judged = (compared(flattened(one)) for one in maps.values())
     result = {
         "counts": counts(points),
         "counts_of_paper": counts(paper),
         "errors_of_theory": errors_of_theory(points),
-        "balance": balance(flattened(tree)) | {"largest_excess_of_root_chaos": root_chaos(points)},
+        "balance": balance(plane) | {"largest_excess_of_root_chaos": root_chaos(points)},
         "laws": laws_of_length(points, judged),
-        "corrected_theory": corrected_theory(tree, points, {"paper": paper, "judged_on": judged}),
+        "corrected_theory": corrected_theory(points, {"paper": paper, "judged_on": judged}),
     }
     for name, one in result.items():
         print(name, *(f"  {key}: {rounded(x, 4)}" for key, x in one.items()), sep="\n")
@@ -121,7 +122,7 @@ def run(output: Output) -> None:
     output.write_picture(draw(points, judged, fitted_laws(points)[0]), "dissipation")
 
 
-def sizes_of(data: xr.DataTree) -> dict[str, int]:
+def sizes_of(data: MapData) -> dict[str, int]:
     """The smallest and the largest number of grains of a map."""
     sizes = np.ravel(data.attrs.get("grains_by_point", data.attrs["grains"]))
     return {"fewest_grains": int(sizes.min()), "most_grains": int(sizes.max())}
@@ -349,7 +350,7 @@ def misfits(laws: CorrelationLaws, points: Points) -> dict[str, np.ndarray]:
     }
 
 
-def corrected_theory(data: xr.DataTree, points: Points, others: dict[str, Points]) -> dict:
+def corrected_theory(points: Points, others: dict[str, Points]) -> dict:
     """The laws, and errors with an inner restitution or packing fraction, or the densest, left out,
     and elsewhere.
     """

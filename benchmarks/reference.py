@@ -11,7 +11,7 @@ Then the intervals are judged: on points of the map that are left out, and on th
 large flows of ``python -m benchmarks reference_runs``. The maps of the paper and of a coarse time
 step give the force ratio at other time steps.
 
-    python -m benchmarks reference          # from benchmarks/results/reference.nc, in two minutes
+    python -m benchmarks reference          # from benchmarks/results/reference*.nc, in two minutes
     python -m benchmarks reference --replace  # and into jaxgran/reference
 """
 
@@ -29,6 +29,7 @@ import jaxgran as jg
 from benchmarks.dissipation import areas
 from benchmarks.output import RESULTS, Output
 from benchmarks.reference_figure import BINARY, draw
+from benchmarks.reference_map import PLANE, reference_points
 from jaxgran.maps.schema import flattened
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.reference.corrected_shear import corrected_shear
@@ -58,7 +59,7 @@ MARGIN = 0.01  # by which the series reaches beyond the map, as a share of its r
 START = ((1.0, 1.0, 1.2, 0.1), (-0.5, -0.5, 0.5, 0.1))  # logarithms of a Shape
 BOUNDED_BY = {"dissipation_rate": "shear_stress"}  # its power is what is dissipated
 AVERAGES = ("pressure", "shear_stress", "local_granular_temperature")
-SOURCE, OTHERS = "reference.nc", ("reference_coarse.nc", "paper.nc")
+OTHERS = "reference_coarse.nc", "paper.nc"  # maps of other time steps
 
 
 def run(output: Output) -> None:
@@ -67,9 +68,9 @@ def run(output: Output) -> None:
     """
     folder = FOLDER if output.replaces else output.folder / "reference"
     folder.mkdir(parents=True, exist_ok=True)
-    others = [jg.open_map(RESULTS / name) for name in OTHERS]
-    made_from = {"map": SOURCE, "table commit": output.hardware["commit"]}
-    make_table(jg.open_map(RESULTS / SOURCE), others, folder, made_from)
+    data, *others = reference_points(), *(flattened(jg.open_map(RESULTS / x)) for x in OTHERS)
+    made_from = {"maps": " and ".join(PLANE), "table commit": output.hardware["commit"]}
+    make_table(data, others, folder, made_from)
     table = read_table(folder)
     fresh, large = (
         json.loads((RESULTS / f"reference_runs{end}.json").read_text()) for end in ("", "_large")
@@ -96,10 +97,10 @@ def run(output: Output) -> None:
 
 
 def make_table(
-    data: xr.DataTree, others: list[xr.DataTree], folder: Path, made_from: dict[str, Any]
+    data: xr.Dataset, others: list[xr.Dataset], folder: Path, made_from: dict[str, Any]
 ) -> None:
     """Write both files of the table of a map into a folder."""
-    flat = flattened(data).stack(point=("packing_fraction", "restitution"))
+    flat = data.stack(point=("packing_fraction", "restitution"))
     finite = np.flatnonzero(np.isfinite(flat["pressure"].values))
     flat = flat.isel(point=finite)
     columns = {name: flat[name].values for name in ("restitution", "packing_fraction")}
@@ -117,7 +118,7 @@ def make_table(
     for other in others:
         name = f"{RATIO}_at_{float(other.attrs['timestep']):g}"
         plane = {axis: data[axis].values for axis in ("packing_fraction", "restitution")}
-        near = flattened(other)[[*_columns(RATIO), f"{RATIO}_stderr"]].reindex(
+        near = other[[*_columns(RATIO), f"{RATIO}_stderr"]].reindex(
             plane, method="nearest", tolerance=1e-6
         )
         at_points = near.stack(point=("packing_fraction", "restitution")).isel(point=finite)
@@ -144,9 +145,7 @@ def make_table(
     write_columns(
         folder / "theory.csv", about | {"theory": theory.__name__} | terms, table_of_terms, digits=9
     )
-    attributes = {
-        name: data.attrs[name] for name in ("timestep", "seeds", "polydispersity", "activation")
-    }
+    attributes = {name: data.attrs[name] for name in ("timestep", "polydispersity", "activation")}
     head: dict[str, Any] = {
         "contents": "averages of the reference map of jaxgran in units of m, sigma and 1/shear "
         "rate, see table.py",

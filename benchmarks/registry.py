@@ -96,8 +96,8 @@ BENCHMARKS = (
             Option("--seeds", "number of seeds, those that are kept included", int),
             Option(
                 "--part",
-                "the plane, flows between loose and dense ones, flows of several sizes, a large one, "
-                "flows that no law was fitted to, or a coarse time step",
+                "the plane, flows between loose and dense ones, flows of several sizes, a large "
+                "one, flows that no law was fitted to, or a coarse time step",
                 choices=("plane", "between", "sizes", "large", "check", "coarse"),
             ),
             Option("--folder", "where the maps that are done are kept", Path),
