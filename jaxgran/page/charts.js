@@ -105,7 +105,7 @@ function drawCurve(id, cells, places, label, title) {
   { ...SCATTER, name: "chosen point", x: [places[chosenPlace]], y: [value[chosenPlace]], marker: diamond(16) }];
   if (theory) traces.splice(1, 0, { ...SCATTER, mode: "lines", name: "kinetic theory", x: places, y: theory, line: { color: colour("theory"), dash: "dash" }, showlegend: true });
   draw(id, traces, { title: { text: label } }, {
-    title: { text: escaped(view.label) }, exponentformat: "power", ...(chosen.log ? { type: "log", dtick } : {}),
+    title: { text: escaped(view.label).replace(" / ", "<br>/ ") }, exponentformat: "power", ...(chosen.log ? { type: "log", dtick } : {}),
   }, {
     title: { text: title, font: { size: 14 }, x: 0.02, xanchor: "left" },
     legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 1, xanchor: "right", font: { size: 12 } },

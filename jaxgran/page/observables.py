@@ -100,20 +100,18 @@ def _observable(
     title = f"{words} ({unit})" if unit else words
     lines = {"error": error, "theory": theory}
     views = [_view(data, title, value, lines, name == "excess")]
-    if theory is not None:
-        # the theory is that of a large system
-        measured, of, stderr = (
-            (value, "", error)
-            if large is None or half is None
-            else (large, " of a large system", half / HALF_INTERVAL)
-        )
+    if theory is not None:  # which is that of a large system
+        if large is None or half is None:
+            measured, stderr = value, error
+        else:
+            measured, stderr = large, half / HALF_INTERVAL
         with np.errstate(divide="ignore", invalid="ignore"):
-            quotient = measured / theory
             quotients = {
                 "error": None if stderr is None else stderr / theory,
                 "theory": theory / theory,
             }
-        views.append(_view(data, f"{words}{of} / kinetic theory", quotient, quotients, False))
+            quotient = measured / theory
+        views.append(_view(data, f"{words} / kinetic theory", quotient, quotients, False))
     texts = [
         _texts(value, error),
         _texts(theory, digits=4),
