@@ -145,7 +145,9 @@ def make_table(
     write_columns(
         folder / "theory.csv", about | {"theory": theory.__name__} | terms, table_of_terms, digits=9
     )
-    attributes = {name: data.attrs[name] for name in ("timestep", "polydispersity", "activation")}
+    attributes = {
+        name: data.attrs[name] for name in ("timestep", "seeds", "polydispersity", "activation")
+    }
     head: dict[str, Any] = {
         "contents": "averages of the reference map of jaxgran in units of m, sigma and 1/shear "
         "rate, see table.py",
