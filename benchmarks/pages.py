@@ -285,7 +285,7 @@ def filled(page: str) -> str:
 
 
 _CODE_OR_GAP = re.compile(r"(^```.*?^```$|\n{2,})", re.MULTILINE | re.DOTALL)
-_LEFT = re.compile(r"\A(---|```|[|#><$!{:\d\s])|^(\||:::)|(  |\\)$", re.MULTILINE)
+_LEFT = re.compile(r"\A(---|```|[|#><$!{:\d\s])|^(\||:::)|(  |\\|<br>)$", re.MULTILINE)
 _LISTED = re.compile(r"^\s*([-+*]|\d+[.)]|#+)\s", re.MULTILINE)
 
 
