@@ -61,12 +61,12 @@ class CorrelationLaws:
 
 
 MEASURED_LAWS = CorrelationLaws(
-    length=np.array([0.2226, 0.02442, 1.461]),
-    length_stderr=np.array([0.007562, 0.003219, 0.03018]),
-    pairs=np.array([0.373, 0.01559, 1.616]),
-    pairs_stderr=np.array([0.02397, 0.0008233, 0.01449]),
+    length=np.array([0.2236, 0.02521, 1.454]),
+    length_stderr=np.array([0.00748, 0.003232, 0.02935]),
+    pairs=np.array([0.374, 0.01605, 1.609]),
+    pairs_stderr=np.array([0.02367, 0.0008292, 0.0142]),
     jamming_fraction=np.array(0.8386),
-    scatter=np.array([0.1265, 0.1582, 0.1499]),
+    scatter=np.array([0.1263, 0.1578, 0.1497]),
     restitution_range=np.array([0.1, 0.95]),
     packing_fraction_range=np.array([0.1, 0.82]),
     fitted_to="294 flows of N = 6400 or 1600, dt = 1e-4",
