@@ -10,8 +10,8 @@ Then all flows share one law of the missing part of an average,
     ν)/0.1),
 
 where w ends the waves towards jamming. Not fitted, and so tests, are a flow of 102,400 grains
-(``reference_map --part large``) and sixteen flows of 256, 1024 and 25,600 grains (``--part
-check``). Standard errors are larger by the root of the reduced χ², as a profile of
+(``reference_map --part large``), sixteen flows of 256, 1024 and 25,600 grains (``--part check``)
+and 84 of 1600 and 6400 (``--part between``). Standard errors are larger by the root of the reduced χ², as a profile of
 velocity that lasts longer than a sample is not in those of the flows.
 
     python -m benchmarks size_limits   # a second
@@ -23,6 +23,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+import xarray as xr
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.stats import chi2
 
@@ -207,14 +208,23 @@ def compared_with_larger(
 
 
 def checks() -> Iterator[dict[str, Any]]:
-    """How flows that no law was fitted to agree with those of 25,600 grains, for each average and
-    smaller N: root mean squares as they are, corrected, and of sampling; the half-width (rms) of
-    the 95 % interval of the correction and of sampling, and the share of flows within.
+    """How flows that no law was fitted to agree with those of more grains: sixteen of 256 and 1024
+    with 25,600, and those between loose and dense ones of the reference map, of 1600 with 6400.
     """
-    small, large = (
-        jg.open_map(RESULTS / f"reference_check_{name}.nc").to_dataset()
-        for name in ("small", "large")
+    small, large, plane, between = (
+        jg.open_map(RESULTS / f"reference{name}.nc").to_dataset()
+        for name in ("_check_small", "_check_large", "", "_between")
     )
+    yield from compared(small, large)
+    same = plane.sel(packing_fraction=between.packing_fraction).drop_vars("point_grains")
+    yield from compared(same.expand_dims(grains=[1600]), between)
+
+
+def compared(small: xr.Dataset, large: xr.Dataset) -> Iterator[dict[str, Any]]:
+    """How flows agree with the same ones of more grains, for each average and smaller N: root mean
+    squares as they are, corrected, and of sampling; the half-width (rms) of the 95 % interval of
+    the correction and of sampling, and the share of flows within.
+    """
     for name, grains in product(LARGE_SYSTEM, small.grains.values.tolist()):
         path, own = f"{name}_large_system", small.sel(grains=grains)
         limit = large[path]
