@@ -11,8 +11,8 @@ Then all flows share one law of the missing part of an average,
 
 where w ends the waves towards jamming. Not fitted, and so tests, are a flow of 102,400 grains
 (``reference_map --part large``), sixteen flows of 256, 1024 and 25,600 grains (``--part check``)
-and 84 of 1600 and 6400 (``--part between``). Standard errors are larger by the root of the reduced χ², as a profile of
-velocity that lasts longer than a sample is not in those of the flows.
+and 84 of 1600 and 6400 (``--part between``). Standard errors are larger by the root of the reduced
+χ², as a profile of velocity that lasts longer than a sample is not in those of the flows.
 
     python -m benchmarks size_limits   # a second
 """
