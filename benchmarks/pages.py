@@ -189,8 +189,8 @@ def over(few: Sequence[float], many: Sequence[float]) -> tuple[float, float]:
     return quotient - 1, math.hypot(few[1], quotient * many[1]) / (1 + many[0])
 
 
-def lacking(restitution: float, packing_fraction: float, few: int, many: int) -> float:
-    """The pressure of few grains over that of many, less one, by the law of the size."""
+def excess_by_law(restitution: float, packing_fraction: float, few: int, many: int) -> float:
+    """By how much the pressure of few grains exceeds that of many by the law of the size."""
     law = SIZE_LAWS["pressure"]
     present = [1 - float(law.missing(restitution, packing_fraction, n)) for n in (few, many)]
     return present[0] / present[1] - 1
@@ -266,7 +266,7 @@ ENVIRONMENT.globals |= {
     for one in (
         *(max, at, point, quotients, ranked, validity),
         *(sig, percent, percent_pm, pm, duration),
-        *(factors, grains_for, shear_stress_ratio_at, lacking, lammps_ratio, output_of_where),
+        *(factors, grains_for, shear_stress_ratio_at, excess_by_law, lammps_ratio, output_of_where),
         *(over, product_of),
     )
 }
@@ -281,7 +281,7 @@ ENVIRONMENT.globals |= {
 
 def filled(page: str) -> str:
     """A page with its numbers."""
-    return wrapped(ENVIRONMENT.from_string(page).render())
+    return f"{wrapped(ENVIRONMENT.from_string(page).render()).rstrip()}\n"
 
 
 _CODE_OR_GAP = re.compile(r"(^```.*?^```$|\n{2,})", re.MULTILINE | re.DOTALL)
@@ -290,8 +290,9 @@ _LISTED = re.compile(r"^\s*([-+*]|\d+[.)]|#+)\s", re.MULTILINE)
 
 
 def wrapped(page: str) -> str:
-    """A page whose paragraphs and lists have lines of at most 100 characters. Tables, pictures,
-    formulas, headings, code and HTML are left as they are.
+    """A page whose paragraphs and lists have lines of at most 100 characters. What begins otherwise
+    than with a word is left as it is (tables, pictures, formulas, headings, numbers, HTML), and so
+    are code and paragraphs with line breaks of their own.
 
     Examples:
       >>> print(wrapped("Two\\nlines.\\n\\n- an\\n  item\\n- `a b`"))

@@ -4,7 +4,7 @@ at dt = 1e-4.
 Packing fractions are 0.01 apart where averages change fast, and restitutions are close where grains
 cluster. Loose flows depend on N and have 6400 grains, dense ones 1600. Every seed is a map of its
 own, sampled over six correlation strains of each flow, and kept beside the results; all are merged.
-So a run that was stopped goes on, and another seed makes all errors smaller. From ν = 0.72 to 0.77,
+So a run that was stopped goes on, and another seed makes errors smaller. From ν = 0.72 to 0.77,
 where 1600 grains are too few for long waves, a map of 6400 (``--part between``) takes the place of
 that of 1600. Flows of several sizes say how averages approach those of a large system (``python -m
 benchmarks size_limits``), and a map at dt = 1e-3 what becomes of the force ratio.
@@ -61,6 +61,9 @@ def reference_points() -> xr.Dataset:
     have a packing fraction, those of the second, of more grains.
     """
     plane, between = (flattened(jg.open_map(RESULTS / name)) for name in PLANE)
+    for name in ("seeds", "timestep", "activation", "polydispersity", "tolerance"):
+        if plane.attrs[name] != between.attrs[name]:
+            raise ValueError(f"{' and '.join(PLANE)} must have the same {name}.")
     grains = xr.full_like(between.pressure, between.attrs["grains"], dtype=int)
     between = between.drop_vars("grains").assign_coords(point_grains=grains)
     own = plane.isel(packing_fraction=~np.isin(plane.packing_fraction, between.packing_fraction))
@@ -68,19 +71,20 @@ def reference_points() -> xr.Dataset:
         data.drop_dims([name for name in data.dims if name in ("seed", "observable")])
         for data in (own, between)
     ]
-    whole = xr.concat(parts, "packing_fraction", join="exact", combine_attrs="override")
+    joined = xr.concat(parts, "packing_fraction", join="exact", combine_attrs="override")
+    whole = joined.sortby("packing_fraction")
     commits = f"{plane.attrs['commit']}; {between.attrs['commit']}"
     whole.attrs |= {"grains_by_point": whole.point_grains.values.ravel(), "commit": commits}
-    return whole.sortby("packing_fraction")
+    return whole
 
 
-def between(quick: bool) -> dict[str, dict[str, Any]]:
-    """The arguments of ``ratio_map`` for flows of middle density with as many grains as loose
-    ones.
+def between(quick: bool) -> dict[str, Any]:
+    """The arguments of ``ratio_map`` for one seed of flows of middle density, with as many grains
+    as loose ones.
     """
     alphas, nus, grains = ((0.1, 0.9), (0.72,), 100) if quick else (RESTITUTIONS, BETWEEN, 6400)
-    chosen: dict[str, Any] = {"restitution": alphas, "packing_fraction": nus, "grains": grains}
-    return {"between": chosen | {"timestep": 5e-4 if quick else 1e-4, "seeds": 2}}
+    plane = {"restitution": alphas, "packing_fraction": nus}
+    return {**plane, "grains": grains, "timestep": 5e-4 if quick else 1e-4}
 
 
 def sizes(quick: bool) -> dict[str, dict[str, Any]]:
@@ -138,11 +142,12 @@ def coarse(quick: bool) -> dict[str, dict[str, Any]]:
     }
 
 
-PARTS = {"between": between, "sizes": sizes, "large": large, "check": check, "coarse": coarse}
+SEVERAL_SEEDS = {"plane": (plane, ""), "between": (between, "_between")}
+PARTS = {"sizes": sizes, "large": large, "check": check, "coarse": coarse}
 
 
 def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT) -> None:
-    """Map what is missing of a part, and write it: all seeds as one map, ``reference.nc``."""
+    """Map what is missing of a part, and write it; all seeds of ``PLANE`` as one map."""
     folder = folder.with_name(f"{folder.name}_quick") if output.quick else folder
     folder.mkdir(parents=True, exist_ok=True)
     command = "python -m benchmarks reference_map"
@@ -156,12 +161,13 @@ def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT
         }
         return jg.ratio_map(**{"seeds": 1, **chosen}, **kept, workers=usable_cores())
 
-    if part == "plane":
+    if part in SEVERAL_SEEDS:
+        chosen, file = SEVERAL_SEEDS[part]
         merged = jg.merge_maps(
-            [made(f"seed_{k}", **plane(output.quick), first_seed=k) for k in range(seeds)]
+            [made(f"{part}_{k}", **chosen(output.quick), first_seed=k) for k in range(seeds)]
         )
         merged.attrs["command"] = command
-        write_dataset(merged, output.path("reference", ".nc"))
+        write_dataset(merged, output.path("reference", f"{file}.nc"))
         return
     for name, chosen in PARTS[part](output.quick).items():
         write_dataset(made(name, **chosen), output.path("reference", f"_{name}.nc"))

@@ -81,7 +81,7 @@ BENCHMARKS = (
         "reference_map",
         "What are stresses, temperatures and the dissipation rate of large systems over the whole "
         "plane?",
-        (120, 1),
+        (180, 1),
         (
             "reference.nc",
             *(
@@ -207,7 +207,7 @@ BENCHMARKS = (
     Benchmark(
         "timestep_study",
         "What becomes of the force ratio as the time step vanishes?",
-        (4, 1),
+        (2.5, 1),
         ("timestep_study.json", "timestep_study.png"),
         one_core=True,
     ),

@@ -10,7 +10,7 @@ the finer time steps of both, by L + A dt^β with one limit L and an amplitude a
 each rule. The interval of L is where χ² exceeds its minimum by no more than its value per degree of
 freedom (at least one), joined over fits that take in one time step less and one more.
 
-    python -m benchmarks timestep_study           # about 4 minutes on two cores
+    python -m benchmarks timestep_study           # two to three minutes on two cores
     python -m benchmarks timestep_study --quick   # two flows down to 1e-4, under a minute
 """
 

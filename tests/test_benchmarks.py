@@ -13,8 +13,10 @@ from matplotlib.text import Text
 
 from benchmarks import output
 from benchmarks.draw import PICTURES
+from benchmarks.reference_map import BETWEEN, PLANE, reference_points
 from benchmarks.registry import BENCHMARKS
 from benchmarks.timestep_study import arrays
+from jaxgran.maps.results import open_map
 
 ROOT = Path(__file__).parents[1]
 
@@ -65,3 +67,17 @@ def test_a_time_step_without_scatter_takes_a_third_of_the_error_of_the_next_coar
     _, excess, error = arrays([dict(zip(names, one, strict=True)) for one in found])
     np.testing.assert_allclose(excess, [0.0, 0.0, 0.1, 0.2], atol=1e-15)
     np.testing.assert_allclose(error, [0.01, 0.03, 0.09, 0.03])
+
+
+def test_points_of_the_reference_map_are_those_of_its_two_maps() -> None:
+    """Each has the averages of the map with more grains, in the order of its axes."""
+    points = reference_points()
+    plane, between = (open_map(output.RESULTS / name) for name in PLANE)
+    assert np.all(np.diff(points.packing_fraction) > 0)
+    assert points.sizes["packing_fraction"] == plane.sizes["packing_fraction"]
+    for nu in points.packing_fraction.values:
+        row, source = points.sel(packing_fraction=nu), between if nu in BETWEEN else plane
+        np.testing.assert_array_equal(row.pressure, source.pressure.sel(packing_fraction=nu))
+        assert set(row.point_grains.values.tolist()) == {6400 if nu <= max(BETWEEN) else 1600}
+    in_order = points.point_grains.values.ravel()
+    np.testing.assert_array_equal(points.attrs["grains_by_point"], in_order)

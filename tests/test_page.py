@@ -18,6 +18,7 @@ from synthetic import one_sentence, random_instant
 
 import jaxgran as jg
 from jaxgran.maps.schema import flattened, path_of
+from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import with_error
 from jaxgran.page.document import Page
 from jaxgran.page.grain_data import PARTS, grain_data
@@ -92,6 +93,10 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
             of_theory = data.get(f"{name}_large_system", average).transpose(*dims)
             quotient = of_theory.values / data[f"theory/{name}"].values
             assert_same_numbers(one["views"][1]["scales"][0]["z"], quotient)
+        if "theory" in view and f"{name}_large_system" in data:
+            half = data[f"{name}_large_system_ci95"].sel(error_source="total").transpose(*dims)
+            errors = half.values / HALF_INTERVAL / data[f"theory/{name}"].values
+            assert_same_numbers(one["views"][1]["error"], errors)
         assert (large is not None) == (f"{name}_large_system" in data)
         if large is not None:
             half_width = data[f"{name}_large_system_ci95"].sel(error_source="total")
