@@ -60,20 +60,22 @@ def reference_points() -> xr.Dataset:
     """The averages of both maps of ``PLANE`` at each packing fraction and restitution: where both
     have a packing fraction, those of the second, of more grains.
     """
-    plane, between = (flattened(jg.open_map(RESULTS / name)) for name in PLANE)
+    whole_plane, more_grains = (flattened(jg.open_map(RESULTS / name)) for name in PLANE)
     for name in ("seeds", "timestep", "activation", "polydispersity", "tolerance"):
-        if plane.attrs[name] != between.attrs[name]:
+        if whole_plane.attrs[name] != more_grains.attrs[name]:
             raise ValueError(f"{' and '.join(PLANE)} must have the same {name}.")
-    grains = xr.full_like(between.pressure, between.attrs["grains"], dtype=int)
-    between = between.drop_vars("grains").assign_coords(point_grains=grains)
-    own = plane.isel(packing_fraction=~np.isin(plane.packing_fraction, between.packing_fraction))
+    grains = xr.full_like(more_grains.pressure, more_grains.attrs["grains"], dtype=int)
+    replaced = np.isin(whole_plane.packing_fraction, more_grains.packing_fraction)
     parts = [
         data.drop_dims([name for name in data.dims if name in ("seed", "observable")])
-        for data in (own, between)
+        for data in (
+            whole_plane.isel(packing_fraction=~replaced),
+            more_grains.drop_vars("grains").assign_coords(point_grains=grains),
+        )
     ]
     joined = xr.concat(parts, "packing_fraction", join="exact", combine_attrs="override")
     whole = joined.sortby("packing_fraction")
-    commits = f"{plane.attrs['commit']}; {between.attrs['commit']}"
+    commits = f"{whole_plane.attrs['commit']}; {more_grains.attrs['commit']}"
     whole.attrs |= {"grains_by_point": whole.point_grains.values.ravel(), "commit": commits}
     return whole
 
@@ -83,8 +85,13 @@ def between(quick: bool) -> dict[str, Any]:
     as loose ones.
     """
     alphas, nus, grains = ((0.1, 0.9), (0.72,), 100) if quick else (RESTITUTIONS, BETWEEN, 6400)
-    plane = {"restitution": alphas, "packing_fraction": nus}
-    return {**plane, "grains": grains, "timestep": 5e-4 if quick else 1e-4}
+    timestep = 5e-4 if quick else 1e-4
+    return {
+        "restitution": alphas,
+        "packing_fraction": nus,
+        "grains": grains,
+        "timestep": timestep,
+    }
 
 
 def sizes(quick: bool) -> dict[str, dict[str, Any]]:
@@ -142,7 +149,7 @@ def coarse(quick: bool) -> dict[str, dict[str, Any]]:
     }
 
 
-SEVERAL_SEEDS = {"plane": (plane, ""), "between": (between, "_between")}
+SEVERAL_SEEDS = {"plane": plane, "between": between}
 PARTS = {"sizes": sizes, "large": large, "check": check, "coarse": coarse}
 
 
@@ -162,12 +169,12 @@ def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT
         return jg.ratio_map(**{"seeds": 1, **chosen}, **kept, workers=usable_cores())
 
     if part in SEVERAL_SEEDS:
-        chosen, file = SEVERAL_SEEDS[part]
+        settings = SEVERAL_SEEDS[part](output.quick)
         merged = jg.merge_maps(
-            [made(f"{part}_{k}", **chosen(output.quick), first_seed=k) for k in range(seeds)]
+            [made(f"{part}_{k}", **settings, first_seed=k) for k in range(seeds)]
         )
         merged.attrs["command"] = command
-        write_dataset(merged, output.path("reference", f"{file}.nc"))
+        write_dataset(merged, output.path("reference", ".nc" if part == "plane" else f"_{part}.nc"))
         return
     for name, chosen in PARTS[part](output.quick).items():
         write_dataset(made(name, **chosen), output.path("reference", f"_{name}.nc"))

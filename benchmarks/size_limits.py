@@ -79,15 +79,14 @@ def run(output: Output) -> None:
         ]
         print(average, rounded(laws[average], 4))
         print(rounded(tests[-1], 4))
-    unfitted = list(checks())
-    for row in unfitted:
+    unfitted = {
+        "checks": list(checks()),
+        "nearly_elastic": list(nearly_elastic(laws["pressure"]["law"]["constants"])),
+    }
+    for row in (row for rows in unfitted.values() for row in rows):
         print(rounded(row, 4))
-    output.write_rows(
-        "size_limits",
-        {"laws": rounded(laws, 5), "tests": rounded(tests, 5), "checks": rounded(unfitted, 4)},
-        "rows",
-        rounded(limits, 5),
-    )
+    head = {"laws": rounded(laws, 5), "tests": rounded(tests, 5), **rounded(unfitted, 4)}
+    output.write_rows("size_limits", head, "rows", rounded(limits, 5))
 
 
 def rows_of_maps(*names: str) -> list[dict[str, Any]]:
@@ -188,10 +187,7 @@ def compared_with_larger(
         == [row["restitution"], row["packing_fraction"]]
         and flow.source == "loose"
     )
-    value, error = row[average]
     grains = np.array([row["grains"], flow.grains[-1]], float)
-    ratio = value / flow.values[-1]
-    spread = ratio * np.hypot(error / value, flow.stderrs[-1] / flow.values[-1])
     ends = []
     for s in laws["exponents"]["interval"]:
         limit, amplitude, *_ = fitted(flow, flow.grains**-s)
@@ -201,10 +197,36 @@ def compared_with_larger(
     large, largest = 1 - missing_part(constants, flow._replace(grains=grains))
     return {
         "grains": [int(n) for n in grains],
-        "measured": [ratio - 1, spread],
+        "measured": excess(*row[average], flow.values[-1], flow.stderrs[-1]),
         "by_exponent": sorted(ends),
         "by_law": large / largest - 1,
     }
+
+
+def excess(value: float, error: float, other: float, other_error: float) -> list[float]:
+    """A value over another, less one, and its standard error."""
+    ratio = value / other
+    return [ratio - 1, ratio * np.hypot(error / value, other_error / other)]
+
+
+def nearly_elastic(constants: Sequence[float]) -> Iterator[dict[str, Any]]:
+    """The pressure of the fewest grains over that of the most, measured and by the law, in the
+    flows of ``elastic_limit``, to which it was not fitted.
+    """
+    rows = [
+        {"source": "elastic", "restitution": row["alpha"], "packing_fraction": row["nu"]}
+        | {"grains": row["grains"], "pressure": [1 + row["pressure"][0], row["pressure"][1]]}
+        for row in json.loads((RESULTS / "elastic_limit.json").read_text())["rows"]
+    ]
+    for flow in flows_of(rows, "pressure"):
+        present = 1 - missing_part(constants, flow)
+        yield {
+            "restitution": flow.restitution,
+            "packing_fraction": flow.packing_fraction,
+            "grains": [int(n) for n in flow.grains[[0, -1]]],
+            "measured": excess(*(x[k] for k in (0, -1) for x in (flow.values, flow.stderrs))),
+            "by_law": present[0] / present[-1] - 1,
+        }
 
 
 def checks() -> Iterator[dict[str, Any]]:
@@ -216,8 +238,9 @@ def checks() -> Iterator[dict[str, Any]]:
         for name in ("_check_small", "_check_large", "", "_between")
     )
     yield from compared(small, large)
-    same = plane.sel(packing_fraction=between.packing_fraction).drop_vars("point_grains")
-    yield from compared(same.expand_dims(grains=[1600]), between)
+    same = plane.sel(packing_fraction=between.packing_fraction)
+    grains = np.unique(same.point_grains)
+    yield from compared(same.drop_vars("point_grains").expand_dims(grains=grains), between)
 
 
 def compared(small: xr.Dataset, large: xr.Dataset) -> Iterator[dict[str, Any]]:
@@ -233,8 +256,8 @@ def compared(small: xr.Dataset, large: xr.Dataset) -> Iterator[dict[str, Any]]:
         parts = [x[f"{path}_ci95"] / limit for x in (own, large)]
         sampling = np.hypot(*(x.sel(error_source="sampling") for x in parts))
         size, common = (x.sel(error_source="size") for x in parts)
-        size = size if name == "force_ratio" else size - common
-        apart, half = own[path] / limit - 1, np.hypot(sampling, size)
+        bound = size if name == "force_ratio" else size - common
+        apart, half = own[path] / limit - 1, np.hypot(sampling, bound)
         rms = {
             "as_it_is": own[name] / limit - 1,
             "corrected": apart,

@@ -105,11 +105,9 @@ def _observable(
             measured, stderr = value, error
         else:
             measured, stderr = large, half / HALF_INTERVAL
+        compared = {"error": stderr, "theory": theory}
         with np.errstate(divide="ignore", invalid="ignore"):
-            quotients = {
-                "error": None if stderr is None else stderr / theory,
-                "theory": theory / theory,
-            }
+            quotients = {part: x if x is None else x / theory for part, x in compared.items()}
             quotient = measured / theory
         views.append(_view(data, f"{words} / kinetic theory", quotient, quotients, False))
     texts = [
