@@ -33,7 +33,6 @@ from jaxgran.model.display import with_error
 from jaxgran.plotting.factors import CURVES, PREFIX, with_temperature
 from jaxgran.reference.table import FACTORS
 from jaxgran.reference.validity import validity
-from jaxgran.sampling.budget import SIZE_LAWS
 
 BUILD = ROOT / "docs" / "_build"
 TEMPLATES = {  # of committed pages
@@ -177,25 +176,6 @@ def percent_pm(value_and_error: Iterable[float]) -> str:
     return pm(*(100 * x for x in value_and_error)) + " %"
 
 
-def over(few: Sequence[float], many: Sequence[float]) -> tuple[float, float]:
-    """By how much an average of few grains exceeds that of many, and its standard error; both as
-    what they exceed the same theory by, with their errors.
-
-    Examples:
-      >>> over((0.5, 0.03), (0.0, 0.0))
-      (0.5, 0.03)
-    """
-    quotient = (1 + few[0]) / (1 + many[0])
-    return quotient - 1, math.hypot(few[1], quotient * many[1]) / (1 + many[0])
-
-
-def excess_by_law(restitution: float, packing_fraction: float, few: int, many: int) -> float:
-    """By how much the pressure of few grains exceeds that of many by the law of the size."""
-    law = SIZE_LAWS["pressure"]
-    present = [1 - float(law.missing(restitution, packing_fraction, n)) for n in (few, many)]
-    return present[0] / present[1] - 1
-
-
 def product_of(
     rows: Iterable[Mapping[str, Any]], timestep: float, flow: Sequence[float] = (0.2, 0.6)
 ) -> float:
@@ -266,8 +246,7 @@ ENVIRONMENT.globals |= {
     for one in (
         *(max, at, point, quotients, ranked, validity),
         *(sig, percent, percent_pm, pm, duration),
-        *(factors, grains_for, shear_stress_ratio_at, excess_by_law, lammps_ratio, output_of_where),
-        *(over, product_of),
+        *(factors, grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where, product_of),
     )
 }
 ENVIRONMENT.globals |= {
