@@ -4,14 +4,16 @@ at dt = 1e-4.
 Packing fractions are 0.01 apart where averages change fast, and restitutions are close where grains
 cluster. Loose flows depend on N and have 6400 grains, dense ones 1600. Every seed is a map of its
 own, sampled over six correlation strains of each flow, and kept beside the results; all are merged.
-So a run that was stopped goes on, and another seed makes errors smaller. From ν = 0.72 to 0.77,
-where 1600 grains are too few for long waves, a map of 6400 (``--part between``) takes the place of
-that of 1600. Flows of several sizes say how averages approach those of a large system (``python -m
-benchmarks size_limits``), and a map at dt = 1e-3 what becomes of the force ratio.
+So a run that was stopped goes on, and another seed makes errors smaller. Where these grains are too
+few for long waves, maps of more take the place of the plane's: 6400 from ν = 0.72 to 0.77
+(``--part between``), and 16,000 up to α = 0.2 and ν = 0.73 (``--part dissipative``). Flows of
+several sizes say how averages approach those of a large system (``python -m benchmarks
+size_limits``), and a map at dt = 1e-3 what becomes of the force ratio.
 
     python -m benchmarks reference_map               # two hours on two cores
     python -m benchmarks reference_map --seeds 4     # two seeds more
     python -m benchmarks reference_map --part between  # ν = 0.72 to 0.77, 6400 grains, an hour
+    python -m benchmarks reference_map --part dissipative --seeds 1  # 16,000, an hour and a half
     python -m benchmarks reference_map --part sizes  # flows of several sizes
     python -m benchmarks reference_map --part large  # one flow of 102,400 grains, half an hour
     python -m benchmarks reference_map --part check  # flows that no law was fitted to, 20 minutes
@@ -22,7 +24,6 @@ benchmarks size_limits``), and a map at dt = 1e-3 what becomes of the force rati
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 import jaxgran as jg
@@ -31,7 +32,7 @@ from jaxgran.environment import usable_cores
 from jaxgran.maps.results import write_dataset
 from jaxgran.maps.schema import flattened
 
-PLANE = "reference.nc", "reference_between.nc"
+PLANE = "reference.nc", "reference_between.nc", "reference_dissipative.nc"
 KEPT = RESULTS / ".reference_map"  # the maps of single seeds
 RESTITUTIONS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
 LOOSE = (0.1, 0.2, 0.3, 0.4, 0.5, 0.56, 0.6, 0.65, 0.7)
@@ -57,27 +58,40 @@ def plane(quick: bool) -> dict[str, Any]:
 
 
 def reference_points() -> xr.Dataset:
-    """The averages of both maps of ``PLANE`` at each packing fraction and restitution: where both
-    have a packing fraction, those of the second, of more grains.
+    """The averages of the maps of ``PLANE`` at each packing fraction and restitution of the first:
+    where several have a point, those of the last one that measured it, of most grains.
     """
-    whole_plane, more_grains = (flattened(jg.open_map(RESULTS / name)) for name in PLANE)
-    for name in ("seeds", "timestep", "activation", "polydispersity", "tolerance"):
-        if whole_plane.attrs[name] != more_grains.attrs[name]:
-            raise ValueError(f"{' and '.join(PLANE)} must have the same {name}.")
-    grains = xr.full_like(more_grains.pressure, more_grains.attrs["grains"], dtype=int)
-    replaced = np.isin(whole_plane.packing_fraction, more_grains.packing_fraction)
-    parts = [
-        data.drop_dims([name for name in data.dims if name in ("seed", "observable")])
-        for data in (
-            whole_plane.isel(packing_fraction=~replaced),
-            more_grains.drop_vars("grains").assign_coords(point_grains=grains),
-        )
-    ]
-    joined = xr.concat(parts, "packing_fraction", join="exact", combine_attrs="override")
-    whole = joined.sortby("packing_fraction")
-    commits = f"{whole_plane.attrs['commit']}; {more_grains.attrs['commit']}"
-    whole.attrs |= {"grains_by_point": whole.point_grains.values.ravel(), "commit": commits}
-    return whole
+    maps = [flattened(jg.open_map(RESULTS / name)) for name in PLANE]
+    points, commits = with_points(maps[0]), [maps[0].attrs["commit"]]
+    for one in maps[1:]:
+        for name in ("timestep", "activation", "polydispersity", "tolerance"):
+            if points.attrs[name] != one.attrs[name]:
+                raise ValueError(f"{', '.join(PLANE)} must have the same {name}.")
+        finer = with_points(one).reindex_like(points[["packing_fraction", "restitution"]])
+        measured = finer.pressure.notnull()
+        points = finer.where(measured, points).assign_attrs(points.attrs)
+        commits.append(one.attrs["commit"])
+    numbers = {name: points[f"point_{name}"].astype(int) for name in ("grains", "seeds")}
+    points = points.assign(status=points.status.astype(int)).assign_coords(
+        {f"point_{name}": x for name, x in numbers.items()}
+    )
+    grains = numbers["grains"].values.ravel()
+    seeds = " or ".join(str(x) for x in sorted(set(numbers["seeds"].values.ravel()), reverse=True))
+    return points.assign_attrs(grains_by_point=grains, seeds=seeds, commit="; ".join(commits))
+
+
+def with_points(data: xr.Dataset) -> xr.Dataset:
+    """The averages of a map, and at each point its numbers of grains and of seeds."""
+    points = data.drop_dims([name for name in data.dims if name in ("seed", "observable")])
+    numbers = {
+        name: data.coords.get(f"point_{name}", data.attrs[name]) for name in ("grains", "seeds")
+    }
+    points = points.drop_vars(["grains", "point_grains"], errors="ignore")
+    filled = {
+        f"point_{name}": xr.full_like(points.pressure, 0) + getattr(x, "variable", x)
+        for name, x in numbers.items()
+    }
+    return points.assign(filled)
 
 
 def between(quick: bool) -> dict[str, Any]:
@@ -91,6 +105,16 @@ def between(quick: bool) -> dict[str, Any]:
         "packing_fraction": nus,
         "grains": grains,
         "timestep": timestep,
+    }
+
+
+def dissipative(quick: bool) -> dict[str, Any]:
+    """The arguments of ``ratio_map`` for one seed of flows in which long waves are strongest."""
+    alphas, nus = ((0.1,), (0.5,)) if quick else (RESTITUTIONS[:4], (*LOOSE, *BETWEEN[:2]))
+    return between(quick) | {
+        "restitution": alphas,
+        "packing_fraction": nus,
+        "grains": 144 if quick else 16_000,
     }
 
 
@@ -149,7 +173,7 @@ def coarse(quick: bool) -> dict[str, dict[str, Any]]:
     }
 
 
-SEVERAL_SEEDS = {"plane": plane, "between": between}
+SEVERAL_SEEDS = {"plane": plane, "between": between, "dissipative": dissipative}
 PARTS = {"sizes": sizes, "large": large, "check": check, "coarse": coarse}
 
 

@@ -87,7 +87,7 @@ BENCHMARKS = (
             *(
                 f"reference_{name}.nc"
                 for name in (
-                    *("between", "sizes_loose", "sizes_dense", "large"),
+                    *("between", "dissipative", "sizes_loose", "sizes_dense", "large"),
                     *("check_small", "check_large", "coarse"),
                 )
             ),
@@ -96,9 +96,9 @@ BENCHMARKS = (
             Option("--seeds", "number of seeds, those that are kept included", int),
             Option(
                 "--part",
-                "the plane, flows between loose and dense ones, flows of several sizes, a large "
-                "one, flows that no law was fitted to, or a coarse time step",
-                choices=("plane", "between", "sizes", "large", "check", "coarse"),
+                "the plane, flows between loose and dense ones, dissipative ones of more grains, "
+                "flows of several sizes, a large one, flows that no law was fitted to, or a coarse time step",
+                choices=("plane", "between", "dissipative", "sizes", "large", "check", "coarse"),
             ),
             Option("--folder", "where the maps that are done are kept", Path),
         ),
