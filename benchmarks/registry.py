@@ -97,7 +97,8 @@ BENCHMARKS = (
             Option(
                 "--part",
                 "the plane, flows between loose and dense ones, dissipative ones of more grains, "
-                "flows of several sizes, a large one, flows that no law was fitted to, or a coarse time step",
+                "flows of several sizes, a large one, flows that no law was fitted to, or a "
+                "coarse time step",
                 choices=("plane", "between", "dissipative", "sizes", "large", "check", "coarse"),
             ),
             Option("--folder", "where the maps that are done are kept", Path),
