@@ -1,5 +1,5 @@
-"""Tables of pages that are read from the code: variables of a map, options, examples,
-benchmarks and notebooks.
+"""Tables of pages that are read from the code: variables of a map, options, examples
+and notebooks.
 """
 
 import ast
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.output import ROOT
-from benchmarks.registry import BENCHMARKS
 from jaxgran.cli.options import option_name, with_options
 from jaxgran.maps.schema import path_of
 from jaxgran.maps.settings import options as parameters
@@ -119,17 +118,3 @@ def title_of(notebook: Path) -> str:
     """The first line of a notebook."""
     first = json.loads(notebook.read_text(encoding="utf-8"))["cells"][0]["source"]
     return "".join(first).split("\n", 1)[0].lstrip("# ")
-
-
-def benchmarks() -> str:
-    """A table of all benchmarks, with links from a page in a folder of ``docs``."""
-    rows = ["| question | command: `python -m benchmarks` | minutes, in full and quick | figures |"]
-    rows.append("| --- | --- | --- | --- |")
-    for one in BENCHMARKS:
-        drawn = [name.removesuffix(".png") for name in one.files if name.endswith(".png")]
-        figures = (
-            ", ".join(f"[{name}](../../benchmarks/results/{name}.png)" for name in drawn) or "–"
-        )
-        full, quick = one.minutes
-        rows.append(f"| {one.question} | `{one.name}` | {full:g}, {quick:g} | {figures} |")
-    return "\n".join(rows)

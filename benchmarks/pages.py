@@ -251,10 +251,7 @@ ENVIRONMENT.globals |= {
 }
 ENVIRONMENT.globals |= {
     name: getattr(page_tables, name)
-    for name in (
-        *("variables", "coordinates", "options"),
-        *("examples", "benchmarks", "notebooks"),
-    )
+    for name in ("variables", "coordinates", "options", "examples", "notebooks")
 }
 
 

@@ -5,10 +5,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.output import RESULTS
+from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.automatic import chosen_settings
-from jaxgran.maps.batches import predicted_cost
+from jaxgran.maps.batches import (
+    expected_correlation_strain,
+    expected_costs,
+    predicted_cost,
+    replica_cost,
+)
 from jaxgran.maps.progress import Meter
 from jaxgran.maps.replica import Advance
+from jaxgran.maps.results import open_map
+from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.settings_checks import stack_of_any_size
 
 MAP: dict[str, Any] = {
     "restitution": (0.2, 0.9),
@@ -52,3 +62,23 @@ def test_work_before_a_replica_is_finished_counts_up_to_its_expected_cost() -> N
     meter.finished((0, 0))
     meter.finished((0, 1))
     assert shares(meter) == ("1/2 points", f"{200 * cost:.0f} % of the work done")
+
+
+def test_the_correlation_strain_that_a_map_expects_is_that_of_the_reference_map() -> None:
+    data = open_map(RESULTS / "reference.nc").to_dataset()
+    settings = MapSettings(**from_attrs(data))
+    flows, count = stack_of_any_size(settings.flows()), [x.grains for x in settings.flows()]
+    ratio = expected_correlation_strain(flows, count) / data.correlation_strain.values.ravel()
+    assert ratio.max() < 1.4 and ratio.min() > 1 / 1.4
+    twice = expected_correlation_strain(flows, np.multiply([[1], [4]], count))
+    assert np.all(twice[1] <= 2 * twice[0] * (1 + 1e-12))
+
+
+def test_the_cost_of_a_replica_is_that_of_its_expected_strains() -> None:
+    """Preparation and sample are several correlation strains, or what is given."""
+    own, _ = chosen_settings({**MAP, "seeds": 1})
+    large, _ = chosen_settings({**MAP, "grains": 6400, "seeds": 1})
+    flow = SETTINGS.flows()[0]
+    given = replica_cost(flow, 1.0, 4.0)
+    assert expected_costs(SETTINGS)[0] == given < expected_costs(own)[0]
+    assert expected_costs(large)[0] > 100 * expected_costs(own)[0]

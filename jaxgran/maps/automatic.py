@@ -10,6 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxgran.dynamics.batch import predicted_cost
+from jaxgran.maps.batches import PREPARED, expected_correlation_strain
 from jaxgran.maps.progress import duration
 from jaxgran.maps.settings import OPTIONS, MapSettings
 from jaxgran.maps.settings_checks import (
@@ -23,8 +24,6 @@ from jaxgran.model.checks import InputError, refused, two_digits
 from jaxgran.model.choices import HALF_INTERVAL, MAX_GRAINS, MAX_REPLICAS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.budget import sampling_target
-from jaxgran.sampling.correlation_strain import flow_correlation_strain
-from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.thresholds import (
     LEAST_PREPARATION,
     LEAST_SAMPLE,
@@ -42,7 +41,6 @@ _LEAST_SAMPLING_SHARE, _SAMPLING_SHARE = 0.2, 0.5
 _WARMEST = 2.0  # temperature over the expected one
 _SAFE: dict[str, Any] = {"grains": 256, "timestep": 1e-6}  # all flows accept these for "auto"
 _SIZES = np.rint(256 * 2 ** np.arange(0, 20, 0.5)).astype(int)  # few, as each one is compiled
-PREPARED = 3.3  # correlation strains until most flows are steady
 SECONDS = 5e-7  # of processor time for a unit of ``predicted_cost``, at 1000 grains
 
 
@@ -77,14 +75,8 @@ def plans_of_sizes(settings: MapSettings, error: float, sizes: np.ndarray) -> Pl
     as √N. Strain and cost are right within a factor of two or three.
     """
     flows = stack_of_any_size(settings.flows())
-    theory = predicted(flows, settings.size_classes(np.size(flows.restitution)))
-    averages = {
-        name: np.asarray(getattr(theory, name), float)[:, None]
-        for name in ("granular_temperature", "pressure", "shear_stress")
-    }
-    alpha, nu = (np.asarray(x)[:, None] for x in (flows.restitution, flows.packing_fraction))
-    area = np.pi / 4 * sizes / nu
-    correlation = flow_correlation_strain(averages, sizes, sizes, area, 1.0)
+    correlation = expected_correlation_strain(flows, sizes[:, None]).T
+    alpha = np.asarray(flows.restitution)[:, None]
     target = _targets(settings, error, flows, sizes)
     scatter = expected_scatter(alpha, sizes)
     enough = target > _LEAST_SAMPLING_SHARE * error / HALF_INTERVAL

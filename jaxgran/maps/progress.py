@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from jaxgran.maps.batches import points_of_part, predicted_cost, replica_cost
+from jaxgran.maps.batches import expected_costs, points_of_part, predicted_cost
 from jaxgran.maps.replica import Advance, Key
 from jaxgran.maps.settings import MapSettings
 
@@ -33,9 +33,7 @@ class Meter:
 
     def __init__(self, settings: MapSettings, quiet: bool):
         self.flows, self.quiet = settings.flows(), quiet
-        self.costs = [
-            replica_cost(flow, settings.equilibrate, settings.strain) for flow in self.flows
-        ]
+        self.costs = expected_costs(settings)
         self.left = dict.fromkeys(points_of_part(settings), settings.seeds)
         self.running: dict[Key, float] = {}  # share of each replica that has been started
         self.total = sum(self.costs[point] for point in self.left) * settings.seeds
