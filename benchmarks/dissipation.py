@@ -1,8 +1,8 @@
 """How far Enskog's dissipation rate is from the measured one, and the theory that follows from a
 law of it.
 
-From the reference map (N = 6400 and 1600, dt = 1e-4): the dissipation rate Γ, which is the power of
-the shear in a steady flow, Enskog's Γ_E at the measured temperature tensor scaled to the local
+From the reference map (N = 1600 to 16,000, dt = 1e-4): the dissipation rate Γ, which is the power
+of the shear in a steady flow, Enskog's Γ_E at the measured temperature tensor scaled to the local
 temperature, and the lengths L = Γ_E/Γ and L′ = (Γ_E/p_E)/(Γ/p) with the contact pressure p; and the
 same from the map of the paper (N = 1000, dt = 1e-5). Laws of L up to ν = 0.75, and laws of L′ and
 p/p_E for all flows, are fitted to the reference map, with each restitution or packing fraction left

@@ -151,8 +151,7 @@ def make_table(
     head: dict[str, Any] = {
         "contents": "averages of the reference map of jaxgran in units of m, sigma and 1/shear "
         "rate, see table.py",
-        "grains": " or ".join(str(size) for size in sorted(set(where[-1].tolist()), reverse=True))
-        + ", extrapolated to a large system",
+        "grains": f"{where[-1].min()} to {where[-1].max()}, extrapolated to a large system",
         **{name: f"{x:g}" if isinstance(x, float) else str(x) for name, x in attributes.items()},
         "map commit": data.attrs["commit"],
         **made_from,

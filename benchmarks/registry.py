@@ -87,7 +87,7 @@ BENCHMARKS = (
             *(
                 f"reference_{name}.nc"
                 for name in (
-                    *("between", "sizes_loose", "sizes_dense", "large"),
+                    *("between", "dissipative", "sizes_loose", "sizes_dense", "large"),
                     *("check_small", "check_large", "coarse"),
                 )
             ),

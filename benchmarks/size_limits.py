@@ -10,9 +10,10 @@ Then all flows share one law of the missing part of an average,
     ν)/0.1),
 
 where w ends the waves towards jamming. Not fitted, and so tests, are a flow of 102,400 grains
-(``reference_map --part large``), sixteen flows of 256, 1024 and 25,600 grains (``--part check``)
-and 84 of 1600 and 6400 (``--part between``). Standard errors are larger by the root of the reduced
-χ², as a profile of velocity that lasts longer than a sample is not in those of the flows.
+(``reference_map --part large``), sixteen flows of 256, 1024 and 25,600 grains (``--part check``),
+84 of 1600 and 6400 (``--part between``), and 36 of 6400 and 16,000 (``--part dissipative``).
+Standard errors are larger by the root of the reduced χ², as a profile of velocity that lasts longer
+than a sample is not in those of the flows.
 
     python -m benchmarks size_limits   # a second
 """
@@ -30,6 +31,7 @@ from scipy.stats import chi2
 import jaxgran as jg
 from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
+from benchmarks.reference_map import LOOSE
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.sampling.budget import LARGE_SYSTEM, SIZE_LAWS, SizeLaw
 
@@ -231,16 +233,18 @@ def nearly_elastic(constants: Sequence[float]) -> Iterator[dict[str, Any]]:
 
 def checks() -> Iterator[dict[str, Any]]:
     """How flows that no law was fitted to agree with those of more grains: sixteen of 256 and 1024
-    with 25,600, and those between loose and dense ones of the reference map, of 1600 with 6400.
+    with 25,600, and those of which the reference map has two sizes: between loose and dense ones
+    1600 and 6400, and among the loose and dissipative ones 6400 and 16,000.
     """
-    small, large, plane, between = (
+    small, large, plane, between, dissipative = (
         jg.open_map(RESULTS / f"reference{name}.nc").to_dataset()
-        for name in ("_check_small", "_check_large", "", "_between")
+        for name in ("_check_small", "_check_large", "", "_between", "_dissipative")
     )
     yield from compared(small, large)
-    same = plane.sel(packing_fraction=between.packing_fraction)
-    grains = np.unique(same.point_grains)
-    yield from compared(same.drop_vars("point_grains").expand_dims(grains=grains), between)
+    for finer in (between, dissipative.sel(packing_fraction=list(LOOSE))):
+        same = plane.sel({name: finer[name] for name in ("packing_fraction", "restitution")})
+        grains = np.unique(same.point_grains)
+        yield from compared(same.drop_vars("point_grains").expand_dims(grains=grains), finer)
 
 
 def compared(small: xr.Dataset, large: xr.Dataset) -> Iterator[dict[str, Any]]:

@@ -5,6 +5,7 @@ is right.
 import inspect
 import subprocess
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -69,15 +70,19 @@ def test_a_time_step_without_scatter_takes_a_third_of_the_error_of_the_next_coar
     np.testing.assert_allclose(error, [0.01, 0.03, 0.09, 0.03])
 
 
-def test_points_of_the_reference_map_are_those_of_its_two_maps() -> None:
-    """Each has the averages of the map with more grains, in the order of its axes."""
+def test_points_of_the_reference_map_are_those_of_its_three_maps() -> None:
+    """Each has the averages of the map with most grains, in the order of its axes."""
     points = reference_points()
-    plane, between = (open_map(output.RESULTS / name) for name in PLANE)
+    plane, between, dissipative = (open_map(output.RESULTS / name) for name in PLANE)
     assert np.all(np.diff(points.packing_fraction) > 0)
     assert points.sizes["packing_fraction"] == plane.sizes["packing_fraction"]
-    for nu in points.packing_fraction.values:
-        row, source = points.sel(packing_fraction=nu), between if nu in BETWEEN else plane
-        np.testing.assert_array_equal(row.pressure, source.pressure.sel(packing_fraction=nu))
-        assert set(row.point_grains.values.tolist()) == {6400 if nu <= max(BETWEEN) else 1600}
+    for nu, alpha in product(points.packing_fraction.values, points.restitution.values):
+        source, grains = (between, 6400) if nu in BETWEEN else (plane, 6400 if nu < 0.72 else 1600)
+        if nu in dissipative.packing_fraction and alpha in dissipative.restitution:
+            source, grains = dissipative, 16_000
+        where = {"packing_fraction": nu, "restitution": alpha}
+        assert points.pressure.sel(where) == source.pressure.sel(where)
+        assert points.point_grains.sel(where) == grains
+        assert points.point_seeds.sel(where) == source.attrs["seeds"]
     in_order = points.point_grains.values.ravel()
     np.testing.assert_array_equal(points.attrs["grains_by_point"], in_order)

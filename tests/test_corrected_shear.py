@@ -130,9 +130,8 @@ def test_the_coefficients_are_those_of_the_benchmark() -> None:
     for words, of in ((MEASURED_LAWS.fitted_to, "map"), (MEASURED_LAWS.judged_on, "judged_on")):
         about = result()[of]
         digits = f"{about['timestep']:.0e}".replace("e-0", "e-")
-        sizes = " or ".join(
-            str(size)
-            for size in sorted({about["most_grains"], about["fewest_grains"]}, reverse=True)
+        sizes = " to ".join(
+            str(size) for size in sorted({about["fewest_grains"], about["most_grains"]})
         )
         assert words == f"{about['points']} flows of N = {sizes}, dt = {digits}"
 
