@@ -95,8 +95,8 @@ xr.Dataset(
 # %% [markdown]
 # ## Beside the reference map
 #
-# `jg.validity` reads a map of up to 16,000 grains at dt = 1e-4, for a large system. Pressures should
-# agree within the combined intervals; force ratios need not, as dt differs.
+# `jg.validity` reads a map of up to 16,000 grains at dt = 1e-4, for a large system. Pressures
+# should agree within the combined intervals; force ratios need not, as dt differs.
 
 # %%
 alphas, nus = np.meshgrid(restitution, packing_fraction)
