@@ -24,6 +24,7 @@ size_limits``), and a map at dt = 1e-3 what becomes of the force ratio.
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 import jaxgran as jg
@@ -59,7 +60,7 @@ def plane(quick: bool) -> dict[str, Any]:
 
 def reference_points() -> xr.Dataset:
     """The averages of the maps of ``PLANE`` at each packing fraction and restitution of the first:
-    where several have a point, those of the last one that measured it, of most grains.
+    where several have a point, those of the last one that measured it, which has the most grains.
     """
     maps = [flattened(jg.open_map(RESULTS / name)) for name in PLANE]
     points, commits = with_points(maps[0]), [maps[0].attrs["commit"]]
@@ -69,6 +70,8 @@ def reference_points() -> xr.Dataset:
                 raise ValueError(f"{', '.join(PLANE)} must have the same {name}.")
         finer = with_points(one).reindex_like(points[["packing_fraction", "restitution"]])
         measured = finer.pressure.notnull()
+        if int(measured.sum()) != one.pressure.size:
+            raise ValueError(f"{PLANE[0]} lacks points of another map of {', '.join(PLANE)}.")
         points = finer.where(measured, points).assign_attrs(points.attrs)
         commits.append(one.attrs["commit"])
     numbers = {name: points[f"point_{name}"].astype(int) for name in ("grains", "seeds")}
@@ -82,16 +85,11 @@ def reference_points() -> xr.Dataset:
 
 def with_points(data: xr.Dataset) -> xr.Dataset:
     """The averages of a map, and at each point its numbers of grains and of seeds."""
+    grains = np.asarray(data.get("point_grains", data.attrs["grains"]))
     points = data.drop_dims([name for name in data.dims if name in ("seed", "observable")])
-    numbers = {
-        name: data.coords.get(f"point_{name}", data.attrs[name]) for name in ("grains", "seeds")
-    }
     points = points.drop_vars(["grains", "point_grains"], errors="ignore")
-    filled = {
-        f"point_{name}": xr.full_like(points.pressure, 0) + getattr(x, "variable", x)
-        for name, x in numbers.items()
-    }
-    return points.assign(filled)
+    ones = xr.ones_like(points.pressure)
+    return points.assign(point_grains=ones * grains, point_seeds=ones * data.attrs["seeds"])
 
 
 def between(quick: bool) -> dict[str, Any]:

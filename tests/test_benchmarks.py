@@ -71,7 +71,7 @@ def test_a_time_step_without_scatter_takes_a_third_of_the_error_of_the_next_coar
 
 
 def test_points_of_the_reference_map_are_those_of_its_three_maps() -> None:
-    """Each has the averages of the map with most grains, in the order of its axes."""
+    """Each has the averages of the map with the most grains, in the order of its axes."""
     points = reference_points()
     plane, between, dissipative = (open_map(output.RESULTS / name) for name in PLANE)
     assert np.all(np.diff(points.packing_fraction) > 0)

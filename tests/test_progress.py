@@ -7,18 +7,19 @@ import pytest
 
 from benchmarks.output import RESULTS
 from jaxgran.maps.attributes import from_attrs
-from jaxgran.maps.automatic import chosen_settings
-from jaxgran.maps.batches import (
+from jaxgran.maps.automatic import (
+    chosen_settings,
     expected_correlation_strain,
     expected_costs,
-    predicted_cost,
-    replica_cost,
+    plans_of_sizes,
 )
+from jaxgran.maps.batches import predicted_cost, replica_cost
 from jaxgran.maps.progress import Meter
 from jaxgran.maps.replica import Advance
 from jaxgran.maps.results import open_map
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.settings_checks import stack_of_any_size
+from jaxgran.sampling.prediction import predicted
 
 MAP: dict[str, Any] = {
     "restitution": (0.2, 0.9),
@@ -68,10 +69,27 @@ def test_the_correlation_strain_that_a_map_expects_is_that_of_the_reference_map(
     data = open_map(RESULTS / "reference.nc").to_dataset()
     settings = MapSettings(**from_attrs(data))
     flows, count = stack_of_any_size(settings.flows()), [x.grains for x in settings.flows()]
-    ratio = expected_correlation_strain(flows, count) / data.correlation_strain.values.ravel()
+    ratio = (
+        expected_correlation_strain(settings, flows, count) / data.correlation_strain.values.ravel()
+    )
     assert ratio.max() < 1.4 and ratio.min() > 1 / 1.4
-    twice = expected_correlation_strain(flows, np.multiply([[1], [4]], count))
-    assert np.all(twice[1] <= 2 * twice[0] * (1 + 1e-12))
+    once, twice = expected_correlation_strain(settings, flows, np.multiply([[1], [4]], count))
+    assert np.all(twice <= 2 * once * (1 + 1e-12)) and np.median(twice / once) == pytest.approx(2)
+
+
+def test_outside_the_reference_map_the_expected_correlation_strain_is_that_of_kinetic_theory() -> (
+    None
+):
+    """As the density vanishes and at α → 1 the two agree: nT/τ."""
+    nearly_elastic = {"restitution": (0.98, 0.99), "packing_fraction": (0.02,), "timestep": 1e-5}
+    settings, _ = chosen_settings({**MAP, **nearly_elastic})
+    flows = stack_of_any_size(settings.flows())
+    theory = predicted(flows)
+    number_density = 4 / np.pi * 0.02
+    heating = number_density * theory.granular_temperature / theory.shear_stress
+    np.testing.assert_allclose(
+        expected_correlation_strain(settings, flows, [64, 64]), heating, rtol=0.1
+    )
 
 
 def test_the_cost_of_a_replica_is_that_of_its_expected_strains() -> None:
@@ -82,3 +100,6 @@ def test_the_cost_of_a_replica_is_that_of_its_expected_strains() -> None:
     given = replica_cost(flow, 1.0, 4.0)
     assert expected_costs(SETTINGS)[0] == given < expected_costs(own)[0]
     assert expected_costs(large)[0] > 100 * expected_costs(own)[0]
+    precise, _ = chosen_settings({**MAP, "grains": 6400, "seeds": 1, "error": 0.05})
+    strains = plans_of_sizes(precise, 0.05, np.array([6400])).strain[:, 0]
+    assert expected_costs(precise)[0] > replica_cost(flow, 0.0, strains[0]) * 100

@@ -10,8 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxgran.dynamics.batch import predicted_cost
-from jaxgran.maps.batches import PREPARED, expected_correlation_strain
-from jaxgran.maps.progress import duration
+from jaxgran.maps.batches import replica_cost
 from jaxgran.maps.settings import OPTIONS, MapSettings
 from jaxgran.maps.settings_checks import (
     FEWEST_STEPS,
@@ -23,7 +22,11 @@ from jaxgran.maps.settings_checks import (
 from jaxgran.model.checks import InputError, refused, two_digits
 from jaxgran.model.choices import HALF_INTERVAL, MAX_GRAINS, MAX_REPLICAS
 from jaxgran.model.flow import ShearFlow
+from jaxgran.reference.surface import coordinates
+from jaxgran.reference.table import CORRECTED, THEORY, shipped_table
 from jaxgran.sampling.budget import sampling_target
+from jaxgran.sampling.correlation_strain import flow_correlation_strain
+from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.thresholds import (
     LEAST_PREPARATION,
     LEAST_SAMPLE,
@@ -41,6 +44,7 @@ _LEAST_SAMPLING_SHARE, _SAMPLING_SHARE = 0.2, 0.5
 _WARMEST = 2.0  # temperature over the expected one
 _SAFE: dict[str, Any] = {"grains": 256, "timestep": 1e-6}  # all flows accept these for "auto"
 _SIZES = np.rint(256 * 2 ** np.arange(0, 20, 0.5)).astype(int)  # few, as each one is compiled
+PREPARED = 3.3  # correlation strains until most flows are steady
 SECONDS = 5e-7  # of processor time for a unit of ``predicted_cost``, at 1000 grains
 
 
@@ -75,7 +79,7 @@ def plans_of_sizes(settings: MapSettings, error: float, sizes: np.ndarray) -> Pl
     as √N. Strain and cost are right within a factor of two or three.
     """
     flows = stack_of_any_size(settings.flows())
-    correlation = expected_correlation_strain(flows, sizes[:, None]).T
+    correlation = expected_correlation_strain(settings, flows, sizes[:, None]).T
     alpha = np.asarray(flows.restitution)[:, None]
     target = _targets(settings, error, flows, sizes)
     scatter = expected_scatter(alpha, sizes)
@@ -92,6 +96,53 @@ def plans_of_sizes(settings: MapSettings, error: float, sizes: np.ndarray) -> Pl
     )
     seconds = np.where(sampled <= longest, settings.seeds * seconds, np.inf)
     return Plan(np.broadcast_to(sizes, seconds.shape), sampled, seconds)
+
+
+def expected_costs(settings: MapSettings) -> list[float]:
+    """Relative cost of a whole replica of each point, if it becomes steady and precise when most
+    do.
+    """
+    flows = settings.flows()
+    count = np.array([flow.grains for flow in flows])
+    correlation = expected_correlation_strain(settings, stack_of_any_size(flows), count)
+    prepared = np.maximum(LEAST_PREPARATION, PREPARED * correlation)
+    sampled = np.maximum(LEAST_SAMPLE, SAMPLE_CORRELATION_STRAINS * correlation)
+    if settings.error is not None:
+        sizes, place = np.unique(count, return_inverse=True)
+        planned = plans_of_sizes(settings, settings.error, sizes).strain
+        longest = np.maximum(LONGEST_STRAIN, LONGEST_CORRELATION_STRAINS * correlation)
+        sampled = np.minimum(planned[np.arange(count.size), place], longest)
+    strains = (
+        expected if given is None else np.full(count.shape, given)
+        for given, expected in ((settings.equilibrate, prepared), (settings.strain, sampled))
+    )
+    return list(map(replica_cost, flows, *(x.tolist() for x in strains)))
+
+
+def expected_correlation_strain(
+    settings: MapSettings, flows: ShearFlow, count: ArrayLike
+) -> np.ndarray:
+    """``flow_correlation_strain`` at the averages of kinetic theory, times what the corrected
+    theory gives over it, here or at the nearest flow in its range; within a factor of 1.4 of that
+    of the reference map.
+
+    Args:
+      settings: have the sizes of the grains.
+      flows: a batch, (points,); its number of grains does not count.
+      count: numbers of grains, (points,), or (sizes, 1) for those of each flow at each size.
+    """
+    table = shipped_table()
+    where = coordinates(
+        *(np.clip(getattr(flows, x), *table.range(x)) for x in ("restitution", "packing_fraction"))
+    )
+    logs = table.series(where)
+    theory = predicted(flows, settings.size_classes(np.size(flows.restitution)))
+    averages = {
+        name: np.asarray(getattr(theory, name), float) * np.exp(logs[CORRECTED + name] - logs[name])
+        for name in THEORY
+    }
+    area = np.pi / 4 * np.asarray(count) / np.asarray(flows.packing_fraction)
+    return flow_correlation_strain(averages, count, count, area, 1.0)
 
 
 def expected_scatter(restitution: ArrayLike, grains: ArrayLike) -> np.ndarray:
@@ -249,3 +300,10 @@ def _plain(value: Any, kind: Any) -> Any:
     real = array.ndim and array.dtype.kind in "iu" and kind is not int
     plain = array.astype(float).tolist() if real else array.tolist()
     return tuple(plain) if isinstance(plain, list) else plain
+
+
+def duration(seconds: float) -> str:
+    """A time as hours:minutes:seconds."""
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}"

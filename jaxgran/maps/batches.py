@@ -7,27 +7,15 @@ from collections.abc import Container
 from heapq import heappop, heappush
 
 import jax
-import numpy as np
-from jax.typing import ArrayLike
 
 from jaxgran.dynamics.batch import predicted_cost
 from jaxgran.dynamics.engine import in_lockstep
 from jaxgran.maps.replica import Key
 from jaxgran.maps.settings import MapSettings
-from jaxgran.maps.settings_checks import stack_of_any_size
 from jaxgran.model.flow import ShearFlow
-from jaxgran.reference.surface import coordinates
-from jaxgran.reference.table import CORRECTED, THEORY, shipped_table
-from jaxgran.sampling.correlation_strain import flow_correlation_strain
-from jaxgran.sampling.thresholds import (
-    LEAST_PREPARATION,
-    LEAST_SAMPLE,
-    RELAXATION_STRAIN,
-    SAMPLE_CORRELATION_STRAINS,
-)
+from jaxgran.sampling.thresholds import LEAST_PREPARATION, LEAST_SAMPLE, RELAXATION_STRAIN
 from jaxgran.sampling.timestep import COARSE_TIMESTEP
 
-PREPARED = 3.3  # correlation strains until most flows are steady
 _PAIR_BYTES = 48  # of memory for each pair of grains, in a search that compares all pairs
 # of memory for each grain: lists, network and state; grains are rounded up to a power of two
 _GRAIN_BYTES = 2500
@@ -44,39 +32,6 @@ def replica_cost(flow: ShearFlow, equilibrate: float | None, strain: float | Non
     return preparation * predicted_cost(flow, coarse) + (
         sample + RELAXATION_STRAIN
     ) * predicted_cost(flow)
-
-
-def expected_costs(settings: MapSettings) -> list[float]:
-    """Relative cost of a whole replica of each point, if it becomes steady when most do."""
-    flows = settings.flows()
-    count = np.array([flow.grains for flow in flows])
-    correlation = expected_correlation_strain(stack_of_any_size(flows), count)
-    prepared, sampled = (
-        np.maximum(least, strains * correlation) if given is None else np.full(len(flows), given)
-        for given, least, strains in (
-            (settings.equilibrate, LEAST_PREPARATION, PREPARED),
-            (settings.strain, LEAST_SAMPLE, SAMPLE_CORRELATION_STRAINS),
-        )
-    )
-    return list(map(replica_cost, flows, prepared.tolist(), sampled.tolist()))
-
-
-def expected_correlation_strain(flow: ShearFlow, count: ArrayLike) -> np.ndarray:
-    """``flow_correlation_strain`` at the averages of the corrected theory, or at those of the
-    nearest flow in its range; within a factor of 1.4 of that of the reference map.
-
-    Args:
-      flow: a batch, (replicas,); its number of grains does not count.
-      count: numbers of grains, (replicas,), or (sizes, 1) for those of each flow at each size.
-    """
-    table = shipped_table()
-    where = coordinates(
-        *(np.clip(getattr(flow, x), *table.range(x)) for x in ("restitution", "packing_fraction"))
-    )
-    logs = table.series(where)
-    averages = {name: np.exp(logs[CORRECTED + name]) for name in THEORY}
-    area = np.pi / 4 * np.asarray(count) / np.asarray(flow.packing_fraction)
-    return flow_correlation_strain(averages, count, count, area, 1.0)
 
 
 def points_of_part(settings: MapSettings) -> list[int]:

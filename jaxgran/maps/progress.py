@@ -10,7 +10,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from jaxgran.maps.batches import expected_costs, points_of_part, predicted_cost
+from jaxgran.maps.automatic import duration, expected_costs
+from jaxgran.maps.batches import points_of_part, predicted_cost
 from jaxgran.maps.replica import Advance, Key
 from jaxgran.maps.settings import MapSettings
 
@@ -115,10 +116,3 @@ def progress(settings: MapSettings, quiet: bool) -> Iterator[Meter]:
         meter.console.print(f"0/{len(meter.left)} points, compiling", highlight=False)
         yield meter
         meter.console.print(meter._line(), highlight=False)
-
-
-def duration(seconds: float) -> str:
-    """A time as hours:minutes:seconds."""
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{seconds:02d}"
