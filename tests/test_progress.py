@@ -37,7 +37,7 @@ def shares(meter: Meter) -> tuple[str, str]:
 
 
 def test_a_map_whose_points_are_all_unfinished_has_done_a_part_of_its_work() -> None:
-    meter = Meter(SETTINGS, quiet=True)
+    meter = Meter(SETTINGS, expected_costs(SETTINGS), quiet=True)
     assert (
         shares(meter) == ("0/2 points", "0 % of the work done")
         and "unknown time left" in meter._line()
@@ -52,7 +52,7 @@ def test_a_map_whose_points_are_all_unfinished_has_done_a_part_of_its_work() -> 
 
 
 def test_work_before_a_replica_is_finished_counts_up_to_its_expected_cost() -> None:
-    meter = Meter(SETTINGS, quiet=True)
+    meter = Meter(SETTINGS, expected_costs(SETTINGS), quiet=True)
     meter.advanced(Advance([(0, 0)], [1e-4], [100]))
     assert "unknown time left" in meter._line()  # most of it was compilation
     for _ in range(100):

@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 
 from jaxgran.dynamics.batch import predicted_cost
 from jaxgran.maps.batches import replica_cost
+from jaxgran.maps.progress import duration
 from jaxgran.maps.settings import OPTIONS, MapSettings
 from jaxgran.maps.settings_checks import (
     FEWEST_STEPS,
@@ -85,10 +86,8 @@ def plans_of_sizes(settings: MapSettings, error: float, sizes: np.ndarray) -> Pl
     scatter = expected_scatter(alpha, sizes)
     enough = target > _LEAST_SAMPLING_SHARE * error / HALF_INTERVAL
     samples = np.where(enough, (scatter / np.where(enough, target, 1)) ** 2, np.inf)
-    least = 2 * np.maximum(LEAST_SAMPLE, SAMPLE_CORRELATION_STRAINS * correlation)
-    sampled = np.maximum(least, samples / settings.seeds * correlation)
-    longest = np.maximum(LONGEST_STRAIN, LONGEST_CORRELATION_STRAINS * correlation)
-    prepared = np.maximum(LEAST_PREPARATION, PREPARED * correlation)
+    prepared, least, longest = _strains(correlation)
+    sampled = np.maximum(2 * least, samples / settings.seeds * correlation)
     coarse = np.maximum(COARSE_TIMESTEP, np.asarray(flows.timestep))
     strain_cost = SECONDS * (sizes / 1000) ** 0.2 * sizes / flows.grains
     seconds = strain_cost * (
@@ -105,18 +104,27 @@ def expected_costs(settings: MapSettings) -> list[float]:
     flows = settings.flows()
     count = np.array([flow.grains for flow in flows])
     correlation = expected_correlation_strain(settings, stack_of_any_size(flows), count)
-    prepared = np.maximum(LEAST_PREPARATION, PREPARED * correlation)
-    sampled = np.maximum(LEAST_SAMPLE, SAMPLE_CORRELATION_STRAINS * correlation)
+    prepared, sampled, longest = _strains(correlation)
     if settings.error is not None:
         sizes, place = np.unique(count, return_inverse=True)
         planned = plans_of_sizes(settings, settings.error, sizes).strain
-        longest = np.maximum(LONGEST_STRAIN, LONGEST_CORRELATION_STRAINS * correlation)
         sampled = np.minimum(planned[np.arange(count.size), place], longest)
     strains = (
         expected if given is None else np.full(count.shape, given)
         for given, expected in ((settings.equilibrate, prepared), (settings.strain, sampled))
     )
     return list(map(replica_cost, flows, *(x.tolist() for x in strains)))
+
+
+def _strains(correlation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Strain of the preparation, and the least and the longest one of a sample, at some correlation
+    strains.
+    """
+    return (
+        np.maximum(LEAST_PREPARATION, PREPARED * correlation),
+        np.maximum(LEAST_SAMPLE, SAMPLE_CORRELATION_STRAINS * correlation),
+        np.maximum(LONGEST_STRAIN, LONGEST_CORRELATION_STRAINS * correlation),
+    )
 
 
 def expected_correlation_strain(
@@ -300,10 +308,3 @@ def _plain(value: Any, kind: Any) -> Any:
     real = array.ndim and array.dtype.kind in "iu" and kind is not int
     plain = array.astype(float).tolist() if real else array.tolist()
     return tuple(plain) if isinstance(plain, list) else plain
-
-
-def duration(seconds: float) -> str:
-    """A time as hours:minutes:seconds."""
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{seconds:02d}"

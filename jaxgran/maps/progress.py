@@ -3,14 +3,13 @@ time left.
 """
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from jaxgran.maps.automatic import duration, expected_costs
 from jaxgran.maps.batches import points_of_part, predicted_cost
 from jaxgran.maps.replica import Advance, Key
 from jaxgran.maps.settings import MapSettings
@@ -29,12 +28,12 @@ class Meter:
 
     Args:
       settings: the map.
+      costs: relative cost of a replica of each point.
       quiet: whether to report nothing.
     """
 
-    def __init__(self, settings: MapSettings, quiet: bool):
-        self.flows, self.quiet = settings.flows(), quiet
-        self.costs = expected_costs(settings)
+    def __init__(self, settings: MapSettings, costs: Sequence[float], quiet: bool):
+        self.flows, self.costs, self.quiet = settings.flows(), costs, quiet
         self.left = dict.fromkeys(points_of_part(settings), settings.seeds)
         self.running: dict[Key, float] = {}  # share of each replica that has been started
         self.total = sum(self.costs[point] for point in self.left) * settings.seeds
@@ -106,9 +105,9 @@ class Meter:
 
 
 @contextmanager
-def progress(settings: MapSettings, quiet: bool) -> Iterator[Meter]:
+def progress(settings: MapSettings, costs: Sequence[float], quiet: bool) -> Iterator[Meter]:
     """A ``Meter`` that is shown while the block runs, and once more at its end."""
-    meter = Meter(settings, quiet)
+    meter = Meter(settings, costs, quiet)
     if meter.console.is_terminal and not quiet:
         with meter.bar:
             yield meter
@@ -116,3 +115,10 @@ def progress(settings: MapSettings, quiet: bool) -> Iterator[Meter]:
         meter.console.print(f"0/{len(meter.left)} points, compiling", highlight=False)
         yield meter
         meter.console.print(meter._line(), highlight=False)
+
+
+def duration(seconds: float) -> str:
+    """A time as hours:minutes:seconds."""
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}"

@@ -18,7 +18,7 @@ import xarray as xr
 from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.engine import Engine, in_lockstep
 from jaxgran.environment import usable_cores
-from jaxgran.maps.automatic import chosen_settings
+from jaxgran.maps.automatic import chosen_settings, expected_costs
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import Provenance
 from jaxgran.maps.dataset import map_dataset, run_attributes
@@ -189,7 +189,7 @@ def run_missing(settings: MapSettings, run: RunOptions, store: Store) -> Measure
     attributes: dict[str, Any] = {"workers": workers, "resumed_replicas": len(results)}
     made: Provenance = {}
     interruption = None
-    with progress(settings, quiet=run.progress is not True) as meter:
+    with progress(settings, expected_costs(settings), run.progress is not True) as meter:
         meter.resumed(results)
 
         def report(advance: Advance) -> None:
