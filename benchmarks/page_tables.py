@@ -2,21 +2,16 @@
 and notebooks.
 """
 
-import ast
 import importlib
-import inspect
 import json
-import re
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from benchmarks.output import ROOT
 from jaxgran.cli.options import option_name, with_options
-from jaxgran.maps.schema import path_of
 from jaxgran.maps.settings import options as parameters
-from jaxgran.maps.variables import COORDINATES, VARIABLES
-from jaxgran.sampling.observables import OBSERVABLES, Observables
+from jaxgran.maps.variables import VARIABLES
+from jaxgran.sampling.observables import OBSERVABLES
 
 
 def unit_of(unit: str | None) -> str:
@@ -24,12 +19,12 @@ def unit_of(unit: str | None) -> str:
 
 
 def variables(group: str) -> str:
-    """A table of the variables of a group of a map, with the formulas of averages.
+    """A table of the variables of a group of a map.
 
     Families of names (of a large system, kinetic theory's predictions, Enskog's factors) have no
     row.
     """
-    header = ("name", "dimensions", "unit", "meaning", "formula")
+    header = ("name", "dimensions", "unit", "meaning")
     rows = []
     for row in VARIABLES:
         name = row.path.rpartition("/")[2]
@@ -39,33 +34,11 @@ def variables(group: str) -> str:
             or (group == "theory" and name in OBSERVABLES)
         )
         if row.group == group and not family:
-            measured = path_of(name) == row.path and name in OBSERVABLES
-            formula = f"`{formulas()[name]}`" if measured else ""
             dims = ", ".join(f"`{dim}`" for dim in row.dims)
-            rows.append((f"`{name}`", dims, unit_of(row.unit), row.meaning, formula))
+            rows.append((f"`{name}`", dims, unit_of(row.unit), row.meaning))
     shown = [k for k in range(len(header)) if any(row[k] for row in rows)]
     lines = [header, ("---",) * len(header), *rows]
     return "\n".join(f"| {' | '.join(line[k] for k in shown)} |" for line in lines)
-
-
-@cache
-def formulas() -> dict[str, str]:
-    """The formulas of the observables as they are written in their table."""
-    (table,) = ast.parse(inspect.getsource(Observables)).body
-    rows = {
-        row.targets[0].id: row.value.args[1].body
-        for row in table.body
-        if isinstance(row, ast.Assign)
-    }
-    return {name: re.sub(r"\b(s|xp)\.", "", ast.unparse(formula)) for name, formula in rows.items()}
-
-
-def coordinates() -> str:
-    """A table of the coordinates of a map."""
-    lines = ["| coordinate | unit | meaning |", "| --- | --- | --- |"]
-    for name, about in COORDINATES.items():
-        lines.append(f"| `{name}` | {unit_of(about.get('units'))} | {about['long_name']} |")
-    return "\n".join(lines)
 
 
 def table_of(command: str, kind: str) -> Any:

@@ -250,8 +250,7 @@ ENVIRONMENT.globals |= {
     )
 }
 ENVIRONMENT.globals |= {
-    name: getattr(page_tables, name)
-    for name in ("variables", "coordinates", "options", "examples", "notebooks")
+    name: getattr(page_tables, name) for name in ("variables", "options", "examples", "notebooks")
 }
 
 

@@ -49,7 +49,7 @@ MAP_OPTIONS = {
 }
 PLOT_OPTIONS = {
     "output": Option(
-        "Folder of the figures, made if missing.",
+        "Folder of the figures.",
         Path,
         default="that of the dataset",
         short="o",
@@ -58,7 +58,7 @@ PLOT_OPTIONS = {
     "format": Option("Format of the figures.", get_args(FileFormat), default="png"),
     "dpi": Option("Dots per inch of a PNG, 50 to 1200.", int, default="200"),
     "caption": Option(
-        "Parameters of the run and notes under the axes.", bool, default="--caption", off=True
+        "Write parameters and notes under the axes.", bool, default="--caption", off=True
     ),
 }
 

@@ -25,8 +25,8 @@ _LISTS = {
     float: f"a list like 0.1,0.5,0.9 or start:stop:count with a count of 2 to {MAX_REPLICAS}",
 }
 FILE = Option("Dataset of a map.", Path)
-QUIET = Option("Say on standard error what went wrong only.", bool, short="q")
-OVERWRITE = Option("Replace the output, whatever it holds.", bool)
+QUIET = Option("Print errors only.", bool, short="q")
+OVERWRITE = Option("Replace an existing file.", bool)
 
 
 def of_map(command: Command) -> dict[str, Option]:

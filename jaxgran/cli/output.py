@@ -27,9 +27,7 @@ from rich.table import Table
 
 from jaxgran.maps.options import Option
 
-JSON = Option(
-    "Print one JSON object in place of tables: value, errors, unit and meaning by name.", bool
-)
+JSON = Option("Print one JSON object instead of tables.", bool)
 _IN_ASCII = str.maketrans(
     {"±": "+-", "σ": "sigma", "γ": "gamma", "\u0307": "-dot", "ν": "nu", "α": "alpha", "²": "^2"}
     | {"–": "-", "−": "-", "×": "x", "…": "...", "’": "'"}

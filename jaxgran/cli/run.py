@@ -39,25 +39,25 @@ RUN_EXAMPLES = {
 RUN_OPTIONS = {
     **of_map("run"),
     "trajectory": Option(
-        "GSD file of the flow, frame by frame.",
+        "Record the flow in a GSD file.",
         Path,
         example="FILE.gsd",
     ),
     "movie": Option(
-        "GIF or MP4 of the flow: grains by their speed, and the forces between them.",
+        "Record a movie of the grains and their forces, GIF or MP4.",
         Path,
         example="FILE.gif",
     ),
     "frame_strain": Option(
-        "Strain between frames, each at the nearest time step.",
+        "Strain between frames.",
         default="0.005 for 40 frames of a movie; a hundredth of --strain, or 0.05 with --error, "
         "with --trajectory",
     ),
     "force_strain": Option(
-        "Strain from each frame on over which its forces are averaged, at most --frame-strain.",
+        "Strain over which the forces of a frame are averaged, at most --frame-strain.",
         default="--frame-strain for a movie, one time step with --trajectory",
     ),
-    "all": Option("Print every average, those of the solver's quality last.", bool),
+    "all": Option("Print every average.", bool),
     "json": JSON,
     "quiet": QUIET,
 }

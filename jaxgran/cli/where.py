@@ -32,12 +32,12 @@ WHERE_OPTIONS = {
     "packing_fraction": Option(
         "Packing fraction ν, in the range of the reference map.", several=True
     ),
-    "factors": Option("Print how far every assumption of the theory is off.", bool),
-    "corrected": Option("Print also the theory with measured correlations.", bool),
-    "csv": Option("Print a line of CSV for each pair, with the names of --json.", bool),
+    "factors": Option("Print the factor of each assumption of the theory.", bool),
+    "corrected": Option("Also print the theory with measured correlations.", bool),
+    "csv": Option("Print CSV, a line for each pair.", bool),
     "json": JSON,
     "law": Option(
-        "File of the constitutive law, at the given values or over the range of the map.",
+        "Write the constitutive law, at the given values or over the range of the map.",
         Path,
         example="FILE.csv",
     ),

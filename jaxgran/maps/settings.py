@@ -89,19 +89,19 @@ class MapSettings:
     )
     error: float | None = option(
         None,
-        "Relative error of force ratio and stresses to reach at every point, half of a 95 % "
-        "interval: sets the strain, and is the target of auto.",
+        "Relative error of force ratio and stresses to reach at every point, as half of a 95 % "
+        "interval; sets the strain, and what is auto.",
         range=_ERROR,
     )
     tolerance: float | None = option(
         None,
-        "Relative residual of a contact solve, in place of that of the solver.",
+        "Relative residual at which a contact solve ends.",
         range=_TOLERANCE,
         default="1e-4, or that of the solver",
     )
     solver: Any = option(
         None,
-        "Projected method of the contact solve.",
+        "Method of the contact solve.",
         get_args(SolverName),
         default="barzilai-borwein; on a CPU after gauss-seidel",
     )
@@ -109,7 +109,7 @@ class MapSettings:
         "midpoint", "When a pair of grains is a contact.", get_args(Activation)
     )
     engine: Any = option(
-        None, "Program that advances the flows.", get_args(EngineName), default="auto"
+        None, "Implementation of the simulation.", get_args(EngineName), default="auto"
     )
     grains_by_point: tuple[int, ...] | None = option(
         None,
@@ -125,9 +125,7 @@ class MapSettings:
         commands=("map",),
         off=True,
     )
-    first_seed: int = option(
-        0, "Number of the first seed; seeds of other numbers start from other grains.", int
-    )
+    first_seed: int = option(0, "Number of the first seed; other numbers are other runs.", int)
     observe: Any = option(
         None,
         "A function as in `sample` that returns numbers or arrays by name; each is averaged into "
@@ -141,14 +139,14 @@ class MapSettings:
     )
     diameters: tuple[float, ...] | None = option(
         None,
-        "Diameters of equally many grains each, such as 1,1.4, in place of the uniform "
-        "distribution; their mean is the unit of length.",
+        "Diameters, each of as many grains, such as 1,1.4, instead of the uniform distribution; "
+        "their mean is the unit of length.",
         values=True,
     )
     part: str | None = option(
         None,
-        "Measure one share of the points only, such as 3/20, the third of twenty of about the "
-        "same cost; `jaxgran merge` joins their files.",
+        "Measure only the Kth of N parts of about the same cost; `jaxgran merge` joins their "
+        "files.",
         str,
         commands=("map",),
         example="K/N",
@@ -257,11 +255,11 @@ class RunOptions:
     """
 
     preset: str = option(
-        "quick", "Starting point of all other parameters.", tuple(PRESETS), commands=("map",)
+        "quick", "Values of all parameters that are not given.", tuple(PRESETS), commands=("map",)
     )
     from_map: str | os.PathLike | None = option(
         None,
-        "Repeat the map of this file; parameters that are given replace those of the file.",
+        "Repeat the map of this file, but for the parameters that are given.",
         Path,
         commands=("map",),
         example="FILE.nc",
@@ -273,7 +271,7 @@ class RunOptions:
         short="o",
         example="FILE.nc",
     )
-    overwrite: bool = option(False, "Replace existing files, whatever they hold.", bool)
+    overwrite: bool = option(False, "Replace existing files.", bool)
     resume: bool = option(
         False,
         "Continue an unfinished map of the output, or read the output if it is finished.",
@@ -281,7 +279,7 @@ class RunOptions:
     )
     workers: int | None = option(
         None,
-        "Number of batches that run at a time, in threads; more than one only on a CPU.",
+        "Batches that run at the same time, in threads; more than one only on a CPU.",
         int,
         commands=("map",),
         default="one for each core on a CPU",
