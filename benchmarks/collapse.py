@@ -3,23 +3,23 @@
 Alternate collisions of neighbours follow a linear law. Let x_k be the speed of approach of
 collision k. Then
 
-    x_{k+2} = c (1 + r)/2 x_{k+1} − r x_k,    c = 1 for three discs, and √2 for four that move
+    x_{k+2} = q (1 + α)/2 x_{k+1} − α x_k,    q = 1 for three discs, and √2 for four that move
     symmetrically,
 
-because a collision passes the share (1 + r)/2 of its approach to the neighbours and turns the rest
+because a collision passes the share (1 + α)/2 of its approach to the neighbours and turns the rest
 around. (Four discs in symmetric motion are two discs and a wall. x of the middle pair is divided by
-√2 here.) The roots λ± of λ² − c (1 + r)/2 λ + r = 0 are real below r_c = tan²(π/12) = 7 − 4√3 =
-0.0718 for three discs (Zhou and Kadanoff, Phys. Rev. E 54, 623, 1996), and below r_c = tan²(π/8) =
+√2 here.) The roots λ± of λ² − q (1 + α)/2 λ + α = 0 are real below α_c = tan²(π/12) = 7 − 4√3 =
+0.0718 for three discs (Zhou and Kadanoff, Phys. Rev. E 54, 623, 1996), and below α_c = tan²(π/8) =
 3 − 2√2 = 0.1716 for these four (Bernu and Mazighi, J. Phys. A 23, 5745, 1990, for discs and a
 wall). What follows:
 
-- Above r_c there are at most ⌈π/θ⌉ collisions, cos θ = c (1 + r)/(4√r), whatever the start.
-- Below r_c some starts collapse. The time between collisions falls by λ₋/λ₊ and the speed by λ₊ at
+- Above α_c there are at most ⌈π/θ⌉ collisions, cos θ = q (1 + α)/(4√α), whatever the start.
+- Below α_c some starts collapse. The time between collisions falls by λ₋/λ₊ and the speed by λ₊ at
   each. A time step ends the collapse with one collision of all, where that time is as short. So the
   steps with contacts grow by 1/log₁₀(λ₊/λ₋) for each decade of dt, and the excess of the force
   ratio falls as dt^β, β = ln(1/λ₊)/ln(λ₊/λ₋).
 
-Three discs collapse below r_c if, and only if, the third disc leaves the second more slowly than λ₊
+Three discs collapse below α_c if, and only if, the third disc leaves the second more slowly than λ₊
 times the first approach. The starts here do: the outer discs come in at equal speeds. Four discs
 keep their symmetry. Counts are averaged over many first gaps, as each alone is a staircase.
 
@@ -52,8 +52,8 @@ LAWS = (
     "exponent",
 )  # what is measured above, and below the threshold
 TITLES = {
-    3: r"three discs, $r_\mathrm{c} = 7-4\sqrt{3} = 0.0718$",
-    4: r"four discs, symmetric, $r_\mathrm{c} = 3-2\sqrt{2} = 0.1716$",
+    3: r"three discs, $\alpha_\mathrm{c} = 7-4\sqrt{3} = 0.0718$",
+    4: r"four discs, symmetric, $\alpha_\mathrm{c} = 3-2\sqrt{2} = 0.1716$",
 }
 LEAST = 1e-6  # smallest excess that is drawn
 MIDDLE = 7  # time step through which the lines of the exact slopes are drawn
@@ -79,7 +79,7 @@ class Roots(NamedTuple):
 
 
 def half_trace(discs: int, restitution: float) -> float:
-    """Half the sum of the roots, c (1 + r)/4."""
+    """Half the sum of the roots, q (1 + α)/4."""
     return {3: 1.0, 4: np.sqrt(2)}[discs] * (1 + restitution) / 4
 
 
@@ -136,7 +136,7 @@ def run(output: Output) -> None:
     gaps = GAP * np.geomspace(0.5, 2, 16 if output.quick else 128)
     rows = [study(discs, r, gaps) for discs, several in RESTITUTIONS.items() for r in several]
     print(
-        "discs      r   steps with contacts, at most   steps that a decade adds   exponent of the "
+        "discs      α   steps with contacts, at most   steps that a decade adds   exponent of the "
         "excess"
     )
     for one in rows:
@@ -220,7 +220,7 @@ def draw(rows: list[dict]) -> Figure:
                 "markersize": 3.5,
                 "markerfacecolor": None if collapses else "white",
                 "linestyle": "none" if collapses else ":",
-                "label": rf"$r={one['restitution']:g}$",
+                "label": rf"$\alpha={one['restitution']:g}$",
             }
             steps, excess = np.array(one["steps"]), np.array(one["excess"])
             drawn = excess > LEAST
@@ -237,8 +237,8 @@ def draw(rows: list[dict]) -> Figure:
                 for axes, line in zip(panels[:, column], lines, strict=True):
                     axes.plot(TIMESTEPS, line, color=style["color"], linewidth=0.8)
         panels[0, column].set_title(TITLES[discs])
-        panels[0, column].legend(ncols=2, title=r"filled: below $r_\mathrm{c}$, open: above")
-        panels[1, column].set_xlabel(r"time step $\Delta t$ ($\sigma$ over the first speed)")
+        panels[0, column].legend(ncols=2, title=r"filled: below $\alpha_\mathrm{c}$, open: above")
+        panels[1, column].set_xlabel(r"time step $\mathrm{d}t$ ($\sigma$ over the first speed)")
     panels[0, 0].set(xscale="log", ylim=(0, 30), ylabel="steps with contacts")
     panels[1, 0].set(yscale="log", ylim=(LEAST, 2), ylabel=f"excess of the {RATIO_LABEL} $- 1$")
     return figure

@@ -243,7 +243,7 @@ def draw(discs: list[dict], grains: list[dict]) -> Figure:
     }
     sources = (
         (discs, r"event-driven, $t_\mathrm{c}$", "o:", "white"),
-        (grains, r"jaxgran, $\Delta t$", "s-", "black"),
+        (grains, r"jaxgran, $\mathrm{d}t$", "s-", "black"),
     )
     for axes, (name, (title, label)) in zip(figure.subplots(1, 2), panels.items(), strict=True):
         for rows, source, look, face in sources:
@@ -264,7 +264,7 @@ def draw(discs: list[dict], grains: list[dict]) -> Figure:
             title=title,
             ylabel=label,
         )
-        axes.set_xlabel(r"$t_\mathrm{c}$ or $\Delta t$ ($1/\dot\gamma$)")
+        axes.set_xlabel(r"$t_\mathrm{c}$ or $\mathrm{d}t$ ($1/\dot\gamma$)")
     figure.axes[0].set_ylim(bottom=0)
     figure.axes[0].legend(loc="lower left")
     return figure
