@@ -1,7 +1,7 @@
 """Exact solutions of the contact problem, each with a certificate: the reference of tests and
 benchmarks.
 
-The problem is 0 ≤ p ⟂ w = W p + u⁻ ≥ 0 with W = G Gᵀ and G = H M^-½; see ``jaxgran.solver``. W is
+The problem is 0 ≤ J ⟂ w = W J + u⁻ ≥ 0 with W = G Gᵀ and G = H M^-½; see ``jaxgran.solver``. W is
 often singular. No method is trusted. Whatever a method returns is polished and then checked in
 extended precision; where the check fails, the next method is tried, and where all fail, an error is
 raised. So an answer cannot be wrong in silence, whatever the processor and its linear algebra.
@@ -30,9 +30,9 @@ class Exact(NamedTuple):
     ==========  ===========  ====  =============================================================
     field       shape        unit  meaning
     ==========  ===========  ====  =============================================================
-    impulses    (contacts,)  mσγ̇   impulses p₀ at restitution zero; zero where there are none
-    changes     (grains, 2)  σγ̇    velocity changes M⁻¹ Hᵀ p₀, which are unique
-    residual    number       –     ‖min(diag(W) p, W p + u⁻)‖ over ‖min(u⁻, 0)‖
+    impulses    (contacts,)  mσγ̇   impulses J₀ at restitution zero; zero where there are none
+    changes     (grains, 2)  σγ̇    velocity changes M⁻¹ Hᵀ J₀, which are unique
+    residual    number       –     ‖min(diag(W) J, W J + u⁻)‖ over ‖min(u⁻, 0)‖
     feasible    flag         –     False where no velocities satisfy all contacts
     ==========  ===========  ====  =============================================================
     """
@@ -143,7 +143,7 @@ METHODS: tuple[Method, ...] = (interior_point, active_set)
 def certified_impulses(
     g: np.ndarray, approach: np.ndarray, methods: Sequence[Method] = METHODS
 ) -> np.ndarray | None:
-    """Impulses p with 0 ≤ p ⟂ G Gᵀ p + u⁻ ≥ 0, to rounding.
+    """Impulses J with 0 ≤ J ⟂ G Gᵀ J + u⁻ ≥ 0, to rounding.
 
     Args:
       g: (contacts, freedoms), G = H M^-½; no row may be zero.
@@ -188,7 +188,7 @@ def certified_impulses(
 
 
 def natural_residual(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> float:
-    """‖min(diag(W) p, W p + u⁻)‖ over ‖min(u⁻, 0)‖, in extended precision; zero where nothing
+    """‖min(diag(W) J, W J + u⁻)‖ over ‖min(u⁻, 0)‖, in extended precision; zero where nothing
     approaches or pushes.
     """
     least = np.minimum(np.sum(g**2, axis=1) * impulses, _after(g, approach, impulses))
@@ -202,14 +202,14 @@ def is_solution(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> bo
 
     No impulse may be negative, and three errors must be small:
 
-    - max |min(diag(W) p, w)|, at most ``ROUNDINGS`` ε of the largest |G| |Gᵀ| p + |u⁻|, the terms
-      that w is the sum of. As min(diag(W) p, w) ≤ w, no contact approaches faster than that after;
+    - max |min(diag(W) J, w)|, at most ``ROUNDINGS`` ε of the largest |G| |Gᵀ| J + |u⁻|, the terms
+      that w is the sum of. As min(diag(W) J, w) ≤ w, no contact approaches faster than that after;
     - the natural residual, at most ``RESIDUAL``, as impulses that are huge and cancel hide an
       approach in rounding;
     - a bound of the kinetic energy of the error of the velocity changes, at most ``ENERGY`` of that
-      of the changes. For exact p₀ and w₀, (p − p₀)ᵀ W (p − p₀) = (p − p₀)·(w − w₀) ≤ p·w − p₀·w ≤ Σ
-      p |w| + Σ p₀ max(−w), where Σ p stands for the unknown Σ p₀. Rounding of p alone makes it ε Σ
-      p |w|, at a mass ratio of 10⁴ some 10⁻¹¹.
+      of the changes. For exact J₀ and w₀, (J − J₀)ᵀ W (J − J₀) = (J − J₀)·(w − w₀) ≤ J·w − J₀·w ≤ Σ
+      J |w| + Σ J₀ max(−w), where Σ J stands for the unknown Σ J₀. Rounding of J alone makes it ε Σ
+      J |w|, at a mass ratio of 10⁴ some 10⁻¹¹.
     """
     if not (np.all(np.isfinite(impulses)) and np.all(impulses >= 0)):
         return False
@@ -241,7 +241,7 @@ def is_obstacle(g: np.ndarray, approach: np.ndarray, weights: np.ndarray) -> boo
 
 
 def _after(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> np.ndarray:
-    """w = G Gᵀ p + u⁻ in the longest numbers that NumPy has; it adds them without the processor's
+    """w = G Gᵀ J + u⁻ in the longest numbers that NumPy has; it adds them without the processor's
     linear algebra.
     """
     wide = g.astype(np.longdouble)

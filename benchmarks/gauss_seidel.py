@@ -1,6 +1,6 @@
 """Another way to solve the contact problem, for comparison only: Gauss–Seidel sweeps.
 
-The problem is 0 ≤ p ⟂ W p + u⁻ ≥ 0 on a network of contacts, see ``jaxgran.contact.network`` and
+The problem is 0 ≤ J ⟂ W J + u⁻ ≥ 0 on a network of contacts, see ``jaxgran.contact.network`` and
 ``jaxgran.contact.solver``.
 """
 

@@ -57,7 +57,7 @@ class Plain:
     def impulses(
         self, i: np.ndarray, j: np.ndarray, n: np.ndarray, approach: np.ndarray
     ) -> np.ndarray:
-        """Solution of 0 ≤ p ⟂ W p + (1 + α) u⁻ ≥ 0, which is that of the law u⁺ = u⁻ + W p, 0 ≤ p ⟂
+        """Solution of 0 ≤ J ⟂ W J + (1 + α) u⁻ ≥ 0, which is that of the law u⁺ = u⁻ + W J, 0 ≤ J ⟂
         u⁺ + α u⁻ ≥ 0.
         """
         h, rows = np.zeros((len(i), len(self.x), 2)), np.arange(len(i))

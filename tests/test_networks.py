@@ -94,7 +94,7 @@ def test_default_converges_to_the_exact_velocities(feasible, solution_of, exact_
 
 
 def test_jacobi_with_the_spectral_bound_lowers_the_objective_in_every_step(feasible, solution_of):
-    """The iteration p ← max(0, p − ω D⁻¹(W p + b)) for ω close to 2, dense; compiled, capped solves
+    """The iteration J ← max(0, J − ω D⁻¹(W J + b)) for ω close to 2, dense; compiled, capped solves
     follow it.
     """
     for number, network in enumerate(feasible):

@@ -81,7 +81,7 @@ def measured(tally) -> dict[str, np.ndarray]:
 
 
 def stress_over_steps(microscopic, impulses: str) -> np.ndarray:
-    """Σ^{ab} = (1/A) Σ σ^a F^b with F = p n / dt, averaged over the time steps."""
+    """Σ^{ab} = (1/A) Σ σ^a F^b with F = J n / dt, averaged over the time steps."""
     stresses = []
     for p, branch in zip(microscopic[impulses], microscopic["branches"], strict=True):
         force = (p / TIMESTEP)[:, None] * branch / np.linalg.norm(branch, axis=1, keepdims=True)

@@ -1,12 +1,12 @@
 """Solutions of contact problems in extended precision, and certificates that anyone can check.
 
-The problem is 0 ≤ p ⟂ w = W p + u⁻ ≥ 0. What is certified are the numbers that stand in the file:
+The problem is 0 ≤ J ⟂ w = W J + u⁻ ≥ 0. What is certified are the numbers that stand in the file:
 normals, masses and u⁻ as the doubles that they are, and impulses as sums of two doubles. w of these
 is computed in fixed-point numbers of ``BITS`` binary places, by integers of Python, so a
 certificate depends on no processor. Errors of it are below 10⁻⁹⁰.
 
-An approximate solution, of any origin, tells which contacts press: A = {W_cc p > w}. On these W_AA
-p = −u⁻_A is solved by iterative refinement (Wilkinson, Rounding Errors in Algebraic Processes,
+An approximate solution, of any origin, tells which contacts press: A = {W_cc J > w}. On these W_AA
+J = −u⁻_A is solved by iterative refinement (Wilkinson, Rounding Errors in Algebraic Processes,
 1963): sparse factors in double precision give the corrections, and residuals in fixed point say
 what is left. A is read again after each. Where more contacts press than have independent normals,
 impulses are not unique, and rounding of the data decides which contacts carry them. Refinement then
@@ -219,7 +219,7 @@ class _Exact:
         self.normals, self.masses, self.approach = (fixed(x) for x in problem[1:])
 
     def momenta(self, impulses: Fixed) -> Fixed:
-        """Hᵀ p, (grains, 2)."""
+        """Hᵀ J, (grains, 2)."""
         along = (self.normals * impulses[:, None]) >> BITS
         total = np.zeros((self.grains, 2), object)
         np.add.at(total, self.ends[:, 0], along)
@@ -227,7 +227,7 @@ class _Exact:
         return total
 
     def after(self, impulses: Fixed) -> Fixed:
-        """w = H M⁻¹ Hᵀ p + u⁻, (contacts,)."""
+        """w = H M⁻¹ Hᵀ J + u⁻, (contacts,)."""
         changes = (self.momenta(impulses) << BITS) // self.masses[:, None]
         i, j = self.ends.T
         return self.approach + (np.sum(self.normals * (changes[i] - changes[j]), axis=1) >> BITS)

@@ -9,10 +9,10 @@ NAME/ends             int32          contacts, 2  numbers i and j of the two gra
 NAME/normals          float64        contacts, 2  unit vectors n from grain j to grain i
 NAME/masses           float64        grains       masses of the grains
 NAME/approach         float64        contacts     u⁻ = n·(v_i − v_j) before, negative if approaching
-NAME/impulses         float64        contacts     solution p at restitution zero; if feasible
+NAME/impulses         float64        contacts     solution J at restitution zero; if feasible
 NAME/impulses_low     float64        contacts     what to add to it in extended precision; if
                                                   feasible
-NAME/velocities       float64        contacts     w = u⁻ + W p after, at restitution zero; if
+NAME/velocities       float64        contacts     w = u⁻ + W J after, at restitution zero; if
                                                   feasible
 NAME/weights          float64        contacts     weights q that prove that there is none; if
                                                   infeasible

@@ -60,7 +60,7 @@ class Discs(NamedTuple):
     positions   (discs, 2)  σ     centres
     velocities  (discs, 2)  σ/t   peculiar velocities c; in the laboratory c + γ̇ y x̂
     last        (discs,)    t     time of the last collision, now being zero
-    side        ()          σ     side L of the cell
+    side        ()          σ     side ℓ of the cell
     tilt        ()          –     offset of the image row above, in L
     ==========  ==========  ====  =================================================================
     """

@@ -1,8 +1,8 @@
 """The contact problem as others pose it: a quadratic program.
 
-0 ≤ p ⟂ W p + u⁻ ≥ 0 with W = G Gᵀ and G = H M^-½ is the condition of optimality of
+0 ≤ J ⟂ W J + u⁻ ≥ 0 with W = G Gᵀ and G = H M^-½ is the condition of optimality of
 
-    minimise ½ pᵀ W p + p·u⁻ subject to p ≥ 0.
+    minimise ½ Jᵀ W J + J·u⁻ subject to J ≥ 0.
 
 All speeds are divided by ‖min(u⁻, 0)‖, since the tolerances of the packages are absolute.
 """

@@ -2,7 +2,7 @@
 of this program.
 
 Tolerances of packages mean different things. So each solver is run with tolerances of its own, a
-power of ten after the other, until its residual ‖min(W_cc p, w)‖ / ‖min(u⁻, 0)‖ is below the
+power of ten after the other, until its residual ‖min(W_cc J, w)‖ / ‖min(u⁻, 0)‖ is below the
 smallest target. A target costs what the cheapest run does that meets it. A solve of more than
 ``LIMIT`` seconds is a failure. After it no tighter tolerance is tried, and no problem of that
 family whose time, growing as the square of the contacts, would be beyond the limit too.
@@ -46,7 +46,7 @@ class Row(NamedTuple):
     ``outcome`` is ok, missed (the residual is not reached), slow (beyond the limit), or skipped
     (see the module). Costs and errors of a failure are not a number, and so are iterations that a
     solver does not count. ``velocity_error`` is max |w − w_exact| / max |min(u⁻, 0)|, and
-    ``stress_error`` that of Σ p n⊗n. A problem without a solution has one row, with the target 0:
+    ``stress_error`` that of Σ J n⊗n. A problem without a solution has one row, with the target 0:
     ok if the solver says so.
     """
 
@@ -109,7 +109,7 @@ def ladder(solver: Solver, entry: Entry, matrix) -> list[Attempt]:
 
 
 def natural_residual(entry: Entry, matrix, impulses: np.ndarray) -> float:
-    """‖min(W_cc p, w)‖ / ‖min(u⁻, 0)‖, as ``jaxgran.contact.solve_contacts``."""
+    """‖min(W_cc J, w)‖ / ‖min(u⁻, 0)‖, as ``jaxgran.contact.solve_contacts``."""
     approach = entry.problem.approach
     least = np.minimum(matrix.diagonal() * impulses, matrix @ impulses + approach)
     return float(np.linalg.norm(least) / np.linalg.norm(np.minimum(approach, 0)))
@@ -152,7 +152,7 @@ def velocity_error(entry: Entry, matrix, impulses: np.ndarray) -> float:
 
 
 def stress_error(entry: Entry, impulses: np.ndarray) -> float:
-    """Relative error of Σ p n⊗n, the stress of grains of one size."""
+    """Relative error of Σ J n⊗n, the stress of grains of one size."""
     moment, true = (
         np.einsum("c,ca,cb", p, entry.problem.normals, entry.problem.normals)
         for p in (impulses, entry.solution.impulses)

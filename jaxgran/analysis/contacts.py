@@ -21,7 +21,7 @@ class LoadedContacts(NamedTuple):
     time: Int[np.ndarray, " loaded"]  # number of the snapshot
     i: Int[np.ndarray, " loaded"]
     j: Int[np.ndarray, " loaded"]
-    force: Float[np.ndarray, " loaded"]  # p/dt, in mσ/t²
+    force: Float[np.ndarray, " loaded"]  # J/dt, in mσ/t²
     normals: Float[np.ndarray, "loaded 2"]  # from grain j to grain i
     distances: Float[np.ndarray, " loaded"]  # of the centres, in σ
 
@@ -37,7 +37,7 @@ class PairForces(NamedTuple):
     """Pairs of grains in loaded contact at any time of a series, and their forces."""
 
     pairs: Int[np.ndarray, "pairs 2"]  # i < j
-    force: Float[np.ndarray, " pairs"]  # mean of p/dt over all snapshots, loaded or not, in mσ/t²
+    force: Float[np.ndarray, " pairs"]  # mean of J/dt over all snapshots, loaded or not, in mσ/t²
     cluster_share: Float[np.ndarray, " pairs"]  # of the force, within clusters of three or more
 
 

@@ -123,7 +123,7 @@ def grid(side: float | Array, count: int) -> Float[Array, "points 2"]:
     """A regular grid of points (count², 2) in the cell, row by row: ``reshape(count, count)`` gives
     axes (y, x).
 
-    The square [0, L)² is one cell of the sheared lattice at any tilt.
+    The square [0, ℓ)² is one cell of the sheared lattice at any tilt.
     """
     ticks = (jnp.arange(count, dtype=jnp.result_type(side, float)) + 0.5) * (side / count)
     return jnp.stack([jnp.tile(ticks, count), jnp.repeat(ticks, count)], axis=-1)

@@ -21,7 +21,7 @@ class JaxMdSpace(NamedTuple):
     ============  ==================  ==============================================================
     displacement  (to, origin)        shortest separation ``to − origin`` in the sheared cell, σ
     shift         (positions, steps)  the positions after the steps, wrapped into the cell, σ
-    box           (2, 2)              its columns are the lattice vectors (L, 0) and (tilt·L, L), σ
+    box           (2, 2)              its columns are the lattice vectors (ℓ, 0) and (tilt·ℓ, ℓ), σ
     ============  ==================  ==============================================================
     """
 

@@ -2,8 +2,8 @@
 imports jax-md.
 
 The grains are sorted into a grid of cells by ``jax_md.partition.cell_list``, in the fractional
-coordinates that move with the sheared cell, s = ((x − tilt·y)/L, y/L). A disc of radius r covers
-±√(1 + tilt²) r/L of s_x and ±r/L of s_y, so with square cells of the larger size, at the largest
+coordinates that move with the sheared cell, s = ((x − tilt·y)/ℓ, y/ℓ). A disc of radius r covers
+±√(1 + tilt²) r/ℓ of s_x and ±r/ℓ of s_y, so with square cells of the larger size, at the largest
 tilt ½, all its neighbours lie in 3×3 cells. Each grain is compared with those in half of them. The
 pairs found are gathered through words of 32 bits, one bit for each candidate.
 
@@ -89,7 +89,7 @@ def _cells_per_side(count: int, capacity: int) -> int:
     """As many cells along each side as the cutoff allows, but at least 3 and on average a grain or
     more in each.
     """
-    reach = math.sqrt(2 * _MARGIN * capacity / (math.pi * count**2))  # cutoff/L
+    reach = math.sqrt(2 * _MARGIN * capacity / (math.pi * count**2))  # cutoff/ℓ
     return max(3, min(int(1 / (reach * math.hypot(1, _LARGEST_TILT))), math.isqrt(count)))
 
 

@@ -187,7 +187,7 @@ def contact_terms(
       half_change: half its change by the impulses, (u⁺ − u⁻)/2.
       one_plus_alpha: 1 + α.
       impulse, binary_impulse: J = (1 + α) J₀, and the same if the collision were binary.
-      clustered: the impulse p where the contact is in a cluster, otherwise 0.
+      clustered: the impulse J where the contact is in a cluster, otherwise 0.
       used, loaded, approaching: 1 where it is a contact, carries an impulse, approaches; otherwise
         0.
     """

@@ -27,7 +27,7 @@ _BATCH = "jax.vmap applies to a batch of problems, as jax.vmap(jaxgran.solve_con
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ContactNetwork:
-    """Frictionless contacts of grains that do not rotate: a contact problem by its geometry.
+    """A contact problem given by its geometry: frictionless contacts of grains that do not rotate.
 
     ========  =============  ====  =================================================================
     field     shape          unit  meaning
@@ -70,7 +70,7 @@ class ContactNetwork:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class DelassusProblem:
-    """A contact problem by its Delassus matrix, which any mechanical system without friction has.
+    """A contact problem given by its Delassus matrix, for any mechanical system without friction.
 
     ========  ====================  ====  ==========================================================
     field     shape                 unit  meaning

@@ -138,11 +138,11 @@ class ProjectedMethod:
         bound: Float[Array, " contacts"],
         best_residual: Float[Array, ""],
     ) -> Any:
-        """What is remembered after the step from y to p, in the form of ``init``.
+        """What is remembered after the step from y to J, in the form of ``init``.
 
         Args:
           now: the state before the step.
-          start, point: y and p, each with its response.
+          start, point: y and J, each with its response.
           bound: the diagonal D.
           best_residual: ‖min(diag(W) J, W J + u⁻)‖, the smallest so far, in σγ̇.
         """

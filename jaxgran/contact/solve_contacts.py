@@ -42,18 +42,18 @@ _DEFAULT = BarzilaiBorwein(tolerance=1e-6)
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ContactResiduals:
-    """How far impulses p are from a solution; all are zero at one, and none has a derivative.
+    """How far impulses J are from a solution; all are zero at one, and none has a derivative.
 
     ==================  =====  ====  ===============================================================
     field               shape  unit  meaning
     ==================  =====  ====  ===============================================================
-    natural_map         ()     –     ‖min(W_cc p, w)‖ / v; what ``tolerance`` is compared with
-    fischer_burmeister  ()     –     ‖a + w − √(a² + w²)‖ / v with a = W_cc p
-    complementarity     ()     –     largest |p w| of a contact / E
-    energy              ()     –     |p·w| / E; the energy after differs from that of the law by
-                                     p·w/(1 + α)
+    natural_map         ()     –     ‖min(W_cc J, w)‖ / v; what ``tolerance`` is compared with
+    fischer_burmeister  ()     –     ‖a + w − √(a² + w²)‖ / v with a = W_cc J
+    complementarity     ()     –     largest |J w| of a contact / E
+    energy              ()     –     |J·w| / E; the energy after differs from that of the law by
+                                     J·w/(1 + α)
     approach            ()     –     largest speed −w at which a contact still approaches / v
-    tension             ()     –     largest speed −W_cc p of an impulse that pulls / v
+    tension             ()     –     largest speed −W_cc J of an impulse that pulls / v
     ==================  =====  ====  ===============================================================
 
     w = u⁺ + α u⁻; v = (1 + α) ‖min(u⁻, 0)‖ and E = (1 + α)² Σ min(u⁻, 0)²/W_cc, or 1 where nothing
@@ -113,7 +113,7 @@ def solve_contacts(
     ===========  ===============================  ==================================================
 
     ``jit``, ``vmap`` and derivatives of impulses and velocities apply, in forward and in reverse
-    mode. They are those of the solution, not of the iteration, and want a tolerance of 1e-8 or
+    mode. They are those of the solution, not of the iteration, and need a tolerance of 1e-8 or
     less. Where impulses are not unique, as in a cluster with more contacts than degrees of freedom,
     velocities are, and one solution is returned.
 
@@ -155,7 +155,7 @@ def contact_residuals(
     argument     type or shape                    unit  meaning
     ===========  ===============================  ====  ===========================
     problem      ContactNetwork, DelassusProblem  –     the contact problem
-    impulses     (contacts,)                      mσγ̇   impulses p to judge
+    impulses     (contacts,)                      mσγ̇   impulses J to judge
     restitution  ()                               –     α in [0, 1]
     ===========  ===============================  ====  ===========================
 

@@ -1,6 +1,6 @@
 """Impulses of a contact network: the loop that runs a projected method until the residual is small.
 
-With normal impulses p and the Delassus operator W = H M⁻¹ Hᵀ the contact law of a step is
+With normal impulses J and the Delassus operator W = H M⁻¹ Hᵀ the contact law of a step is
 
     u⁺ = u⁻ + W J,    0 ≤ J ⟂ u⁺ + α u⁻ ≥ 0.
 

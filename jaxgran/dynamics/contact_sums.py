@@ -22,7 +22,7 @@ class Impulses(NamedTuple):
     field     shape        unit  meaning
     ========  ===========  ====  ==========================================================
     contacts  (contacts,)  mσγ̇   J = (1 + α) J₀
-    binary    (contacts,)  mσγ̇   (1 + α) m₁₂ max(0, −u⁻), if every collision were binary
+    binary    (contacts,)  mσγ̇   (1 + α) m_ij max(0, −u⁻), if every collision were binary
     changes   (contacts,)  σγ̇    u⁺ − u⁻, change of the relative normal velocities
     grains    (grains, 2)  mσγ̇   total impulse of each grain
     loaded    (grains,)    –     contacts with an impulse of each grain

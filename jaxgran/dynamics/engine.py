@@ -35,8 +35,7 @@ _SINGLE_PRECISION = (
 class Jax:
     """The engine in JAX: every backend, precision and solver, and derivatives.
 
-    The replicas of a batch advance each by itself on a processor, and in lockstep on an
-    accelerator.
+    The replicas of a batch advance one by one on a processor, in lockstep on an accelerator.
 
     Examples:
       >>> Jax()

@@ -46,8 +46,8 @@ class Snapshot(Indexable):
     ===========  ===========  ====  ===============================================================
     state        State        –     positions, and velocities before the contacts act
     contacts     Contacts     –     the contact network of the step
-    impulses     (contacts,)  mσ/t  impulse p of each contact: grain i gains p n, grain j loses p n
-    timestep     ()           t     dt; the force of a contact is p/dt
+    impulses     (contacts,)  mσ/t  impulse J of each contact: grain i gains J n, grain j loses J n
+    timestep     ()           t     dt; the force of a contact is J/dt
     shear_rate   ()           1/t   γ̇
     restitution  ()           –     α
     status       ()           –     worst status since the last snapshot, with that of its own solve

@@ -52,12 +52,12 @@ class Tally:
     steps: Float[Array, "*b"] = _sum(
         FLIGHT, "–", "time steps, counted as a float (they exceed an int32)"
     )
-    impulse: Float[Array, "*b"] = _sum(CONTACT, "mσγ̇", "contact impulses p")
+    impulse: Float[Array, "*b"] = _sum(CONTACT, "mσγ̇", "contact impulses J")
     binary_impulse: Float[Array, "*b"] = _sum(
-        CONTACT, "mσγ̇", "(1+α) m₁₂ max(0, −u⁻), the impulses if every collision were binary"
+        CONTACT, "mσγ̇", "(1+α) m_ij max(0, −u⁻), the impulses if every collision were binary"
     )
     contact_moment: Float[Array, "*b 2 2"] = _sum(
-        CONTACT, "mσ²γ̇", "σ ⊗ p n over the contacts, σ the centre-to-centre vector", _TENSOR
+        CONTACT, "mσ²γ̇", "d ⊗ J n over the contacts, d the centre-to-centre vector", _TENSOR
     )
     binary_moment: Float[Array, "*b 2 2"] = _sum(
         CONTACT, "mσ²γ̇", "the same with the binary impulses", _TENSOR
@@ -101,7 +101,7 @@ class Tally:
     binary_dissipation: Float[Array, "*b"] = _sum(
         CONTACT,
         "mσ²γ̇²",
-        "½ (1−α²) m₁₂ max(0, −u⁻)², the energy lost if every collision were binary",
+        "½ (1−α²) m_ij max(0, −u⁻)², the energy lost if every collision were binary",
     )
     largest_overlap: Float[Array, "*b"] = _sum(LARGEST, "σ", "overlap of a contact")
     worst_residual: Float[Array, "*b"] = _sum(LARGEST, "–", "relative residual of a solve")
@@ -139,9 +139,7 @@ class Tally:
         return jax.tree.map(lambda *both: jnp.stack(both), self, other).total(axis=0)
 
     def total(self, axis: int | tuple[int, ...]) -> "Tally":
-        """The tally of all that stands along leading axes: sums, and the larger of each of
-        ``EXTREMES``.
-        """
+        """The tally over all leading axes: sums, and the largest of each of ``EXTREMES``."""
         sums = {name: getattr(self, name) for name in TABLE}
         joined = {
             name: x.max(axis) if name in EXTREMES else x.sum(axis) for name, x in sums.items()

@@ -1,6 +1,6 @@
 """Trajectories in GSD files, for OVITO, freud and HOOMD-blue, and for reading back.
 
-The GSD box is centred at the origin and spanned by (L, 0) and (tilt·L, L), the lattice of the
+The GSD box is centred at the origin and spanned by (ℓ, 0) and (tilt·ℓ, ℓ), the lattice of the
 sheared cell. Chunks of the GSD schema have single precision; further chunks store exact values, so
 a state is read back bit for bit.
 
@@ -8,18 +8,18 @@ a state is read back bit for bit.
 chunk                          shape           unit    meaning
 =============================  ==============  ======  =============================================
 configuration/step             (1,)            –       time steps since the first frame
-configuration/box              (6,)            σ, –    L, L, 0, tilt, 0, 0; two dimensions
+configuration/box              (6,)            σ, –    ℓ, ℓ, 0, tilt, 0, 0; two dimensions
 particles/position             (grains, 3)     σ       centres, in the box around the origin; z = 0
 particles/velocity             (grains, 3)     σγ̇      peculiar velocities c, before the contacts
                                                        act; in the laboratory c + γ̇ y x̂
 particles/diameter, /mass      (grains,)       σ, m    diameters and masses
 bonds/group                    (bonds, 2)      –       pairs i < j of grains in loaded contact in
                                                        the steps of ``force_strain``
-log/bonds/force                (bonds,)        mσγ̇²    their forces p/dt, mean over these steps
+log/bonds/force                (bonds,)        mσγ̇²    their forces J/dt, mean over these steps
 log/particles/contact_force    (grains,)       mσγ̇²    sum of the forces of its bonds, by magnitude
 log/particles/cluster          (grains,)       –       number of its cluster, joined by bonds
 log/particles/cluster_size     (grains,)       –       grains of its cluster; 1 without bonds
-log/particles/exact_position   (grains, 2)     σ       positions of the state, in [0, L)
+log/particles/exact_position   (grains, 2)     σ       positions of the state, in [0, ℓ)
 log/particles/exact_velocity   (grains, 2)     σγ̇      velocities of the state
 log/particles/exact_radius     (grains,)       σ       radii; in the first frame only
 log/particles/exact_mass       (grains,)       m       masses; in the first frame only

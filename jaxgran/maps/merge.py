@@ -38,10 +38,10 @@ def merge_maps(
 ) -> xr.DataTree:
     """One map of the replicas of several maps: of parts, of other seeds, or of other axes.
 
-    Each axis of the result has the values of all maps. The result is that of one run, bit for bit:
-    averages, standard errors and all else are computed from the sums of all replicas, so the
-    scatter between seeds of different maps is in the errors. A replica that several maps have is
-    that of the first of them. Points that no map has are NaN with the status ``not_run``.
+    Each axis of the result has the values of all maps. The result is that of a single run, bit for
+    bit: averages and standard errors are computed from the sums of all replicas, so errors include
+    the scatter between seeds of different maps. Of a replica that occurs twice, the first counts.
+    Points that no map has are NaN with the status ``not_run``.
 
     Args:
       maps: data of maps, as ``ratio_map`` returns them, or their files. All settings but the axes,

@@ -1,6 +1,6 @@
-"""The sheared periodic cell (Lees–Edwards): a square of side L whose image rows slide along x.
+"""The sheared periodic cell (Lees–Edwards): a square of side ℓ whose image rows slide along x.
 
-The lattice vectors are (L, 0) and (tilt·L, L). Adding an integer to the tilt gives the same
+The lattice vectors are (ℓ, 0) and (tilt·ℓ, ℓ). Adding an integer to the tilt gives the same
 lattice, so the tilt is kept in [−½, ½). Velocities are peculiar (SLLOD): all images of a grain have
 the same one. The velocity jump between images enters through γ̇ Δy of the separation.
 
@@ -21,7 +21,7 @@ Number = Any  # a number, or an array of them
 
 
 def cell_side(radii: Float[Array, " grains"], packing_fraction: float | Array) -> Float[Array, ""]:
-    """Side L of the square cell in which the discs have the given packing fraction.
+    """Side ℓ of the square cell in which the discs have the given packing fraction.
 
     Examples:
       >>> # four discs of diameter 1, each fills π/4 of a unit square
@@ -42,7 +42,7 @@ def remap_tilt(tilt: Number) -> Number:
 
 
 def nearest_image(dx: Number, dy: Number, side: Number, tilt: Number) -> tuple[Number, Number]:
-    """The whole numbers of columns and rows, lattice vectors (L, 0) and (tilt·L, L), to subtract
+    """The whole numbers of columns and rows, lattice vectors (ℓ, 0) and (tilt·ℓ, ℓ), to subtract
     from a separation for the minimum image.
     """
     rows = rint(dy / side)
@@ -50,9 +50,9 @@ def nearest_image(dx: Number, dy: Number, side: Number, tilt: Number) -> tuple[N
 
 
 def image_in_cell(x: Number, y: Number, side: Number, tilt: Number) -> tuple[Number, Number]:
-    """The image of a position that has x and y in [0, L)."""
+    """The image of a position that has x and y in [0, ℓ)."""
     rows = floor(y / side)
-    rows = where(y - rows * side >= side, rows + 1, rows)  # L plus a tiny negative y rounds to L
+    rows = where(y - rows * side >= side, rows + 1, rows)  # ℓ plus a tiny negative y rounds to ℓ
     x_of_row, y_of_row = x - rows * tilt * side, y - rows * side
     x_of_cell = x_of_row - side * floor(x_of_row / side)
     return where(x_of_cell >= side, 0.0, x_of_cell), where(y_of_row < 0, 0.0, y_of_row)
@@ -77,7 +77,7 @@ def displacement(
 
 
 def wrap(positions: Float[Array, "grains 2"], side: Array, tilt: Array) -> Float[Array, "grains 2"]:
-    """The images of the positions that have x and y in [0, L)."""
+    """The images of the positions that have x and y in [0, ℓ)."""
     return jnp.stack(image_in_cell(positions[:, 0], positions[:, 1], side, tilt), axis=-1)
 
 
@@ -114,6 +114,6 @@ def minimum_image(
 def centred(
     positions: Float[np.ndarray, "grains 2"], side: float, tilt: float
 ) -> Float[np.ndarray, "grains 2"]:
-    """The images of positions in [0, L) that lie in the sheared cell whose centre is the origin."""
+    """The images of positions in [0, ℓ) that lie in the sheared cell whose centre is the origin."""
     x, y = (positions - side / 2).T
     return np.stack([x - side * np.floor((x - tilt * y) / side + 0.5), y], axis=-1)

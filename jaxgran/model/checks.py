@@ -8,11 +8,10 @@ import numpy as np
 
 
 class InputError(ValueError):
-    """Input that is not accepted; the message is one sentence that says what is.
+    """Invalid input; the message is one sentence that says what is accepted.
 
-    Parameter names in the message stand in backticks, unless the message begins with the name of
-    ``field``. So a caller with other names for the parameters, such as the command line, can
-    replace them.
+    Names of parameters in the message are in backticks, unless the message begins with that of
+    ``field``, so that the command line can replace them by its options.
 
     Attributes:
       field: the parameter at fault, or "".

@@ -31,8 +31,8 @@ class State(Indexable):
     grains      Grains       –     radii and masses
     positions   (grains, 2)  σ     centres, wrapped into the cell
     velocities  (grains, 2)  σ/t   peculiar velocities c; in the laboratory frame c + γ̇ y x̂
-    side        ()           σ     side L of the cell
-    tilt        ()           –     offset of the image row above, in L, in [−½, ½)
+    side        ()           σ     side ℓ of the cell
+    tilt        ()           –     offset of the image row above, in ℓ, in [−½, ½)
     ==========  ===========  ====  =====================================================
     """
 

@@ -9,13 +9,10 @@ from jaxgran.page.reference_map import reference_dataset
 
 
 def explore(data: MapData | None = None, output: str | Path | None = None) -> Page:
-    """A page to look into a map with a browser. It is one file, and needs neither a network nor a
-    running program.
+    """An interactive page of a map: one HTML file, which works offline.
 
-    Beside the numbers of the selected point stands what the reference map says of kinetic theory
-    there.
-
-    A notebook shows the page if this call is the last line of a cell.
+    The numbers of the selected point are shown beside what the reference map says of kinetic theory
+    there. A notebook displays the page if this call is the last line of a cell.
 
     Args:
       data: dataset of a map, as ``ratio_map`` returns it and ``open_map`` reads it. Every number at

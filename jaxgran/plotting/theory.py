@@ -88,7 +88,7 @@ def has_clusters(data: xr.Dataset) -> bool:
 
 def error_parts(data: xr.Dataset, quantity: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return the error of the theory in `pressure` or `shear_stress` of a large system, the part of
-    it that the binary assumption has, and their standard errors.
+    it due to the binary assumption, and their standard errors.
 
     ========== ============================ ========================================================
     name       value                        source of the standard error
@@ -129,8 +129,8 @@ def error_parts(data: xr.Dataset, quantity: str) -> dict[str, tuple[np.ndarray, 
 
 @styled
 def theory_errors(data: MapData) -> Figure:
-    """Return the error of kinetic theory in the plane of 1 − α and ν, and the part of it that the
-    binary assumption has.
+    """Return the error of kinetic theory in the plane of 1 − α and ν, and the part of it
+    due to the binary assumption.
 
     The rows are pressure and shear stress. The columns are the whole error and that of the binary
     assumption alone, as in :func:`error_parts`; the rest is the closure. Contours have the error as

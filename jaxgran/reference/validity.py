@@ -197,9 +197,9 @@ def validity(restitution: Any, packing_fraction: Any) -> Validity:
       packing_fraction: ν, a number or an array; the two broadcast.
 
     Returns:
-      A ``Validity``. Its ``verdict()`` says it in a sentence. Numbers and arrays that are known
-      give arrays of NumPy in double precision. ``jax.jit``, ``jax.vmap`` and derivatives apply, in
-      double precision only; where a traced value is outside the measured range, the result is NaN.
+      A ``Validity``, whose ``verdict()`` sums it up in a sentence. Its arrays are of NumPy, or of
+      JAX if an argument is traced: ``jax.jit``, ``jax.vmap`` and derivatives apply, in double
+      precision only, and the result is NaN outside the measured range.
 
     Raises:
       InputError: (a ValueError) a value is outside the measured range, which the message names; or

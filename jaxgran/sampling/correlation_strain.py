@@ -4,7 +4,7 @@ and its error bars.
 It is the strain of one independent sample: 2s for a correlation that decays exponentially over a
 strain s. Two processes are slow. The granular temperature follows the heating by the shear over a
 strain of nT/τ, thermal energy over shear stress. Waves of velocity and density as long as the cell
-decay over a strain that grows as its side L, about 0.35 γ̇ L √(ρ/p): the time that a sound wave
+decay over a strain that grows as its side ℓ, about 0.35 γ̇ ℓ √(ρ/p): the time that a sound wave
 needs for a third of the cell. ``python -m benchmarks size_study`` compares this law with the
 correlation of measured series.
 """
@@ -23,7 +23,7 @@ from jaxgran.model.status import Status
 from jaxgran.sampling.sample import Sample
 from jaxgran.sampling.thresholds import FEWEST_CORRELATION_STRAINS, RELAXATION_STRAIN
 
-_WAVE = 0.35  # correlation strain of the longest waves over γ̇ L √(ρ/p)
+_WAVE = 0.35  # correlation strain of the longest waves over γ̇ ℓ √(ρ/p)
 
 
 def flow_correlation_strain(
@@ -33,7 +33,7 @@ def flow_correlation_strain(
     area: ArrayLike,
     shear_rate: ArrayLike,
 ) -> Any:
-    """Correlation strain of a flow: max(nT/τ, 0.35 γ̇ L √(ρ/p)), and at least that of the contact
+    """Correlation strain of a flow: max(nT/τ, 0.35 γ̇ ℓ √(ρ/p)), and at least that of the contact
     network.
 
     Args:

@@ -29,7 +29,7 @@ def heated(
     """A random packing with Gaussian velocities of a given granular temperature; or many of them at
     once.
 
-    It is the start of a free cooling, or of a flow that the user equilibrates.
+    A start for free cooling, or for a flow that you equilibrate yourself.
 
     Args:
       flow: parameters of one flow, sheared or not; or numbers (replicas,) of several flows.

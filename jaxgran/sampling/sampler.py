@@ -52,17 +52,17 @@ def sample(
     """Shear a flow, or a batch of flows, and average its observables; ``jit``, ``vmap`` and
     ``lax.map`` apply.
 
-    A batch is a flow or a state whose arrays have a leading (replicas,) axis; what lacks it is the
-    same for all. Each replica has the results of its own call. ``jax.vmap`` of this function does
-    the same. A batch is shared out to all cores of a processor, and batches of any size need one
-    compilation there.
+    A batch is a flow or a state whose arrays have a leading (replicas,) axis; values without it are
+    shared. Every replica has the results that a call of its own would have. ``jax.vmap`` of this
+    function does the same. On a processor, a batch runs on all cores, and batches of all sizes
+    share one compilation.
 
     The numba engine takes all blocks in one call, unless there is ``observe`` or ``callback``. Then
     every block begins with a new list of near pairs, and its trajectory differs by rounding, which
     grows as in any chaotic flow.
 
     The result of ``observe`` is averaged over **every** time step, in the same run (see
-    ``observer``). A few instants do not suffice for contact forces: at a short time step, most
+    ``observer``). A few instants are not enough for contact forces: at a short time step, most
     instants of a collisional flow have no contact with a force. A function of the forces, which are
     ``impulses / timestep``, is averaged exactly. Positions and velocities are observed once a free
     flight; their averages are accurate up to the strain of a flight, about 1e-3.
@@ -75,12 +75,11 @@ def sample(
         value does not recompile.
       blocks: number of equal parts of the strain, static; a tally is kept for each.
       observe: a function of a ``Snapshot`` that returns a pytree of arrays to average. It is
-        static: each new function, such as a lambda that is written anew, is compiled, so define it
-        once. Beside the numba engine this takes about 2 s. Where the engine ``Jax`` runs, or the
-        function uses values from outside that JAX traces, that engine is compiled with it, in about
-        20 s. The next process loads the program. The contacts are those of a step with an
-        approaching contact, before the impulses act; other steps have none. The size of their
-        buffers varies, so ``observe`` must return sums over contacts or over grains.
+        static, and each new function is compiled, so define it once and not as a lambda in a loop.
+        If it uses traced values from outside, the engine ``Jax`` runs, and is compiled with it. The
+        contacts are those of a step with an approaching contact, before the impulses act; other
+        steps have none. The size of their buffers varies, so ``observe`` must return sums over
+        contacts or over grains.
       callback: called after each block with the state and the sample so far, or those of the
         batch; if its result is true, the sample ends. JAX transformations do not apply then.
       solver: solves the contacts of each step, by default ``BarzilaiBorwein()``. New numbers in it

@@ -75,7 +75,7 @@ def prepare(
 ) -> State:
     """A flow in its steady state at its time step, ready for ``sample``; or many of them at once.
 
-    A batch of keys gives as many states, each to rounding that of its own flow and key alone.
+    A batch of keys gives a batch of states. Each is, to rounding, what its flow and key alone give.
 
     Args:
       flow: parameters of one flow; or numbers (replicas,) of several flows.

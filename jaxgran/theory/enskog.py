@@ -24,7 +24,7 @@ class Collisions(NamedTuple):
 
     stress: Float[Array, "*replicas 2 2"]  # Σ d n ⊗ n p over the collisions, the collisional stress
     speed_stress: Float[Array, "*replicas 2 2"]  # the same, each times its speed of approach w
-    dissipation_rate: Float[Array, "*replicas"]  # Σ (1 − α²) μ w²/2 over the collisions
+    dissipation_rate: Float[Array, "*replicas"]  # Σ (1 − α²) m_ij w²/2 over the collisions
     collision_rate: Float[Array, "*replicas"]  # collisions per grain and time
     source: Float[Array, "*replicas 2 2 classes"]  # change of the temperature tensors per time
 
@@ -78,9 +78,9 @@ def enskog_collisions(
 
     Let n be the normal from grain i to grain j. The approach speed w = (v_i − v_j)·n is Gaussian,
     with mean −γ̇ d_ij n_x n_y and variance n·(T_i/m_i + T_j/m_j)·n; averages ⟨ ⟩ are over w > 0. A
-    collision transfers the impulse p = (1 + α) m_ij w and loses the energy (1 − α) p w/2, so the
+    collision transfers the impulse J = (1 + α) m_ij w and loses the energy (1 − α) J w/2, so the
     stress is ½ Σ_ij n_i n_j χ_ij d_ij² (1 + α) m_ij ∮ dn n ⊗ n ⟨w²⟩ and the dissipation rate
-    ¼ Σ_ij n_i n_j χ_ij d_ij (1 − α²) m_ij ∮ dn ⟨w³⟩. It adds −p n/m_i to v_i, so the temperature
+    ¼ Σ_ij n_i n_j χ_ij d_ij (1 − α²) m_ij ∮ dn ⟨w³⟩. It adds −J n/m_i to v_i, so the temperature
     tensor of class i changes at the rate Σ_j n_j χ_ij d_ij ∮ dn ⟨w [p² n n/m_i − p (n c_i + c_i
     n)]⟩, where ⟨w² c_i⟩ = 2⟨w⟩ T_i·n/m_i, because c_i and w are jointly Gaussian.
 

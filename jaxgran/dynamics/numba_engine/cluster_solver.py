@@ -38,7 +38,7 @@ from jaxgran.dynamics.numba_engine.layout import (
     RESPONSE_CHANGE,
     SECOND,
     STEP,
-    P,
+    J,
 )
 
 largest_eigenvalue = LAW["largest_eigenvalue"]
@@ -54,7 +54,7 @@ _RELAXATION = np.minimum(1 + 0.075 * np.log2(np.maximum(np.arange(641), 1)), 1.7
 
 @inline_njit
 def solve_cluster(m, target, max_steps, grains, network, clusters):
-    """Write the impulses p₀ of cluster m at restitution zero.
+    """Write the impulses J₀ of cluster m at restitution zero.
 
     ``target`` is the squared residual to reach. Returns the iterations, the squared residual, and
     ok, iteration_limit, infeasible or nonfinite.
@@ -73,12 +73,12 @@ def solve_cluster(m, target, max_steps, grains, network, clusters):
             jammed = _is_jammed(size, clusters)
             iterations += more
             for c in range(size):
-                rows[c, P] = iterate[c, BEST]
+                rows[c, J] = iterate[c, BEST]
         status = OK if squared_residual <= target else INFEASIBLE if jammed else ITERATION_LIMIT
         if not squared_residual < math.inf:
             status = NONFINITE
     for c in range(size):
-        impulses[IMPULSE, places[c]] = rows[c, P]
+        impulses[IMPULSE, places[c]] = rows[c, J]
     return iterations, squared_residual, status
 
 
@@ -102,7 +102,7 @@ def _take_contacts(start, size, grains, network, clusters):
         rows[c, MU_NY] = contacts[NY, place] * reduced_mass
         rows[c, MU_U], rows[c, INVERSE_MU] = contacts[APPROACH, place] * reduced_mass, mobility
         rows[c, INVERSE_MU_MI], rows[c, INVERSE_MU_MJ] = mobility * mi, mobility * mj
-        rows[c, P] = 0.0
+        rows[c, J] = 0.0
         dv[i, 0] = dv[i, 1] = dv[j, 0] = dv[j, 1] = 0.0
         c += one
         n += length
@@ -113,22 +113,22 @@ def _take_contacts(start, size, grains, network, clusters):
 
 @inline_njit
 def _mu_response(c, rows, ends, dv):
-    """μ (W p) of a contact, from the changes of the grains' velocities."""
+    """μ (W J) of a contact, from the changes of the grains' velocities."""
     i, j = ends[c, FIRST], ends[c, SECOND]
     return rows[c, MU_NX] * (dv[i, 0] - dv[j, 0]) + rows[c, MU_NY] * (dv[i, 1] - dv[j, 1])
 
 
 @njit
 def _is_jammed(size, clusters):
-    """Whether impulses have grown without moving anything: pᵀWp is far below −pᵀu⁻, which it is at
+    """Whether impulses have grown without moving anything: JᵀWJ is far below −Jᵀu⁻, which it is at
     a solution.
     """
     rows, ends, dv = clusters.rows, clusters.ends, clusters.dv
-    p_w_p = minus_p_u = 0.0
+    j_w_j = minus_j_u = 0.0
     for c in range(size):
-        p_w_p += rows[c, P] * _mu_response(c, rows, ends, dv) * rows[c, INVERSE_MU]
-        minus_p_u -= rows[c, P] * rows[c, MU_U] * rows[c, INVERSE_MU]
-    return p_w_p < JAMMED_RESPONSE * minus_p_u
+        j_w_j += rows[c, J] * _mu_response(c, rows, ends, dv) * rows[c, INVERSE_MU]
+        minus_j_u -= rows[c, J] * rows[c, MU_U] * rows[c, INVERSE_MU]
+    return j_w_j < JAMMED_RESPONSE * minus_j_u
 
 
 @inline_njit
@@ -137,7 +137,7 @@ def _sweep(size, target, max_sweeps, clusters):
     residual.
 
     The update of a contact, without relaxation and over its reduced mass, is its residual min(W_cc
-    p, u), so a sweep estimates the norm at no cost; the norm of a single state decides. ``dv`` are
+    J, u), so a sweep estimates the norm at no cost; the norm of a single state decides. ``dv`` are
     the changes of the grains' velocities.
     """
     rows, ends, dv = clusters.rows, clusters.ends, clusters.dv
@@ -148,9 +148,11 @@ def _sweep(size, target, max_sweeps, clusters):
         for c in range(size):  # without a branch, which would be mispredicted
             i, j = ends[c, FIRST], ends[c, SECOND]
             ix, iy, jx, jy = dv[i, 0], dv[i, 1], dv[j, 0], dv[j, 1]
-            mu_nx, mu_ny, p = rows[c, MU_NX], rows[c, MU_NY], rows[c, P]
-            change = max(relaxation * (mu_nx * (jx - ix) + mu_ny * (jy - iy) - rows[c, MU_U]), -p)
-            rows[c, P] = p + change
+            mu_nx, mu_ny, impulse = rows[c, MU_NX], rows[c, MU_NY], rows[c, J]
+            change = max(
+                relaxation * (mu_nx * (jx - ix) + mu_ny * (jy - iy) - rows[c, MU_U]), -impulse
+            )
+            rows[c, J] = impulse + change
             per_mass_i, per_mass_j = (
                 change * rows[c, INVERSE_MU_MI],
                 change * rows[c, INVERSE_MU_MJ],
@@ -165,7 +167,7 @@ def _sweep(size, target, max_sweeps, clusters):
             squared_residual = 0.0
             for c in range(size):
                 mu_velocity = _mu_response(c, rows, ends, dv) + rows[c, MU_U]
-                error = min(rows[c, P], mu_velocity) * rows[c, INVERSE_MU]
+                error = min(rows[c, J], mu_velocity) * rows[c, INVERSE_MU]
                 squared_residual += error * error
             keep_going &= not squared_residual <= target
     return sweeps, squared_residual
@@ -190,21 +192,24 @@ def _descend(size, target, max_iterations, clusters):
         momentum, descent = k / (k + 3.0), 0.0
         for c in range(size):
             i, j = ends[c, FIRST], ends[c, SECOND]
-            p, bound = rows[c, P], iterate[c, BOUND]
-            start = p + momentum * iterate[c, STEP]
+            impulse, bound = rows[c, J], iterate[c, BOUND]
+            start = impulse + momentum * iterate[c, STEP]
             velocity = (
                 iterate[c, RESPONSE]
                 + momentum * iterate[c, RESPONSE_CHANGE]
                 + rows[c, MU_U] * rows[c, INVERSE_MU]
             )
-            new_p = max(0.0, start - stride * velocity / bound)
-            descent += (start - new_p) * (new_p - p) * bound
-            iterate[c, STEP] = new_p - p
-            rows[c, P] = new_p
+            new_impulse = max(0.0, start - stride * velocity / bound)
+            descent += (start - new_impulse) * (new_impulse - impulse) * bound
+            iterate[c, STEP] = new_impulse - impulse
+            rows[c, J] = new_impulse
             dv[i, 0] = dv[i, 1] = dv[j, 0] = dv[j, 1] = 0.0
         for c in range(size):
-            i, j, p = ends[c, FIRST], ends[c, SECOND], rows[c, P]
-            per_mass_i, per_mass_j = p * rows[c, INVERSE_MU_MI], p * rows[c, INVERSE_MU_MJ]
+            i, j, impulse = ends[c, FIRST], ends[c, SECOND], rows[c, J]
+            per_mass_i, per_mass_j = (
+                impulse * rows[c, INVERSE_MU_MI],
+                impulse * rows[c, INVERSE_MU_MJ],
+            )
             dv[i, 0] += per_mass_i * rows[c, MU_NX]
             dv[i, 1] += per_mass_i * rows[c, MU_NY]
             dv[j, 0] -= per_mass_j * rows[c, MU_NX]
@@ -214,7 +219,7 @@ def _descend(size, target, max_iterations, clusters):
         for c in range(size):
             bound, mu_response = iterate[c, BOUND], _mu_response(c, rows, ends, dv)
             response = mu_response * rows[c, INVERSE_MU]
-            error = min(rows[c, P], mu_response + rows[c, MU_U]) * rows[c, INVERSE_MU]
+            error = min(rows[c, J], mu_response + rows[c, MU_U]) * rows[c, INVERSE_MU]
             step, change = iterate[c, STEP], response - iterate[c, RESPONSE]
             iterate[c, RESPONSE_CHANGE], iterate[c, RESPONSE] = change, response
             squared_residual += error * error
@@ -224,7 +229,7 @@ def _descend(size, target, max_iterations, clusters):
         if squared_residual < best:
             best = squared_residual
             for c in range(size):
-                iterate[c, BEST] = rows[c, P]
+                iterate[c, BEST] = rows[c, J]
         window_ends = iterations % WINDOW == WINDOW - 1
         if guarded or (window_ends and not math.sqrt(best) < PROGRESS * last_residual):
             stride, k = 1.0, k + 1 if guarded and not descent > 0.0 else 0
@@ -243,7 +248,7 @@ def _descend(size, target, max_iterations, clusters):
 
 @inline_njit
 def _start_descent(size, clusters):
-    """Write the diagonal D and the response W p of the contacts of a cluster."""
+    """Write the diagonal D and the response W J of the contacts of a cluster."""
     rows, iterate, ends = clusters.rows, clusters.iterate, clusters.ends
     dv, matrices = clusters.dv, clusters.matrices
     for c in range(size):
@@ -264,6 +269,6 @@ def _start_descent(size, clusters):
         width_i = largest_eigenvalue(matrices[i, 0], matrices[i, 1], matrices[i, 2])
         width_j = largest_eigenvalue(matrices[j, 0], matrices[j, 1], matrices[j, 2])
         bound = width_i * inverse_mass_i + width_j * inverse_mass_j
-        iterate[c, BOUND], iterate[c, BEST] = bound, rows[c, P]
+        iterate[c, BOUND], iterate[c, BEST] = bound, rows[c, J]
         iterate[c, STEP] = iterate[c, RESPONSE_CHANGE] = 0.0
         iterate[c, RESPONSE] = nx * (dv[i, 0] - dv[j, 0]) + ny * (dv[i, 1] - dv[j, 1])

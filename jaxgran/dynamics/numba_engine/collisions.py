@@ -49,7 +49,7 @@ def collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, sums
 
 @inline_njit
 def solve_network(contacts, touched_count, target, max_steps, grains, network, clusters):
-    """Write the impulses p₀ of a network at restitution zero, to a residual of ``target``.
+    """Write the impulses J₀ of a network at restitution zero, to a residual of ``target``.
 
     Returns the most iterations of a cluster, the squared residual, and the worst status.
     """
