@@ -102,7 +102,7 @@ def test_law_of_the_size_is_the_fitted_one_and_its_bound_holds(average: str) -> 
 
 
 @pytest.mark.parametrize("average", LARGE_SYSTEM)
-def test_corrected_averages_are_those_of_flows_that_no_law_was_fitted_to(average: str) -> None:
+def test_corrected_averages_are_those_of_flows_with_more_grains(average: str) -> None:
     """Flows of more grains, sixteen, 84 and 36, are within the intervals as often as those of 95 %
     are, and the intervals are not much wider than what they bound.
     """

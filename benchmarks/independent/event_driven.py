@@ -12,7 +12,7 @@ energy, and no inelastic collapse can last. At t_c = 0 these are inelastic hard 
 How it works: near pairs are found with a cell list. The list stands until discs may have approached
 by more than its skin. The next collisions of near pairs stand in a heap. A stamp of each disc
 changes when it collides, and events with an old stamp are dropped. The periodic cell is sheared
-(Lees and Edwards): the image row above moves with γ̇L.
+(Lees and Edwards): the image row above moves with γ̇ℓ.
 
 Units are those of jaxgran: mean diameter σ, mass of a mean grain m, and 1/γ̇.
 """
@@ -61,7 +61,7 @@ class Discs(NamedTuple):
     velocities  (discs, 2)  σ/t   peculiar velocities c; in the laboratory c + γ̇ y x̂
     last        (discs,)    t     time of the last collision, now being zero
     side        ()          σ     side ℓ of the cell
-    tilt        ()          –     offset of the image row above, in L
+    tilt        ()          –     offset of the image row above, in ℓ
     ==========  ==========  ====  =================================================================
     """
 
