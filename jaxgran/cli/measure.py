@@ -24,7 +24,6 @@ from jaxgran.cli.terminal import (
 )
 from jaxgran.maps.interruption import Interrupted, is_interruption
 from jaxgran.maps.settings import OPTIONS
-from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import with_error
 
 _PRINTED = {
@@ -183,7 +182,7 @@ def _say_errors(data) -> None:
 
 def print_large_system(data) -> None:
     """Print the averages of a large system, and where their errors come from: the values of a flow,
-    for each number of grains, or the medians of a map and the largest ones.
+    for each number of grains, beside kinetic theory; or the medians of a map and the largest ones.
     """
     from jaxgran.maps.schema import flattened, parts
 
@@ -204,10 +203,10 @@ def _print_large_system(data) -> None:
     from jaxgran.maps.variables import MEASURED_FLOWS
 
     point = data.status.size == 1
-    size = f"N = {data.attrs['grains']}" if "grains" in data.attrs else "its N"
-    values = (size, "large system") if point else ("correction", "total")
+    values = ("large system", "kinetic theory") if point else ("correction", "total")
     if point:
-        title = "Averages of a large system, ± 95 %, and the parts of their errors in %"
+        size = f" from N = {data.attrs['grains']}" if "grains" in data.attrs else ""
+        title = f"Averages of a large system{size}, ± 95 %; parts of the errors in %"
     else:
         title = (
             "Averages of a large system: correction for N, and half-widths of 95 % intervals by "
@@ -220,15 +219,28 @@ def _print_large_system(data) -> None:
         errors = relative_ci95(data, name)
         at_size, large = data[name].values, data[f"{name}_large_system"].values
         if point:
-            half = HALF_INTERVAL * data[f"{name}_stderr"].item()
-            whole = data[f"{name}_large_system_ci95"].sel(error_source="total").item()
-            cells = [with_error(at_size.item(), half), with_error(large.item(), whole)]
+            total = data[f"{name}_large_system_ci95"].sel(error_source="total").item()
+            cells = [with_error(large.item(), total), _predicted(data, name)]
         else:
             cells = [_percent(large / at_size - 1), _percent(errors["total"])]
         sources = {source: _percent(errors[source]) for source in _SOURCES}
         sources |= {"timestep": "–"} if name == "force_ratio" else {}
         rows.append([words, *cells, *sources.values()])
     print_table(title, ("average", *values, *_SOURCES.values()), rows)
+
+
+def _predicted(data, name: str) -> str:
+    """What kinetic theory predicts for one flow; its temperature is compared with the local one."""
+    pressure, shear_stress, temperature = (
+        data[f"theory/{x}"].item() for x in ("pressure", "shear_stress", "granular_temperature")
+    )
+    values = {
+        "pressure": pressure,
+        "shear_stress": shear_stress,
+        "local_granular_temperature": temperature,
+        "macroscopic_friction": shear_stress / pressure,
+    }
+    return f"{values[name]:.3g}" if name in values else ""
 
 
 def _are_measured(data) -> bool:

@@ -170,7 +170,7 @@ def _write_frames(files: Mapping[str, Path], frames: int, film: Any, quiet: bool
 
 def _print_averages(data, all: bool) -> None:
     """Print the averages with errors, a column for each number of grains; for one of them also
-    effective sample sizes and predictions of kinetic theory.
+    effective sample sizes.
     """
     from jaxgran.maps.schema import parts
 
@@ -184,7 +184,7 @@ def _print_averages(data, all: bool) -> None:
     tables = [_rows(point, all) for point in points]
     if len(tables) == 1:
         columns = ("observable", "value ±\nstandard error", "unit", "effective\nsamples")
-        print_table(title, (*columns, "kinetic\ntheory"), tables[0], numbers=False)
+        print_table(title, columns, tables[0], numbers=False)
         return
     rows = [
         same[0] if len(same[0]) == 1 else [same[0][0], same[0][2], *(row[1] for row in same)]
@@ -195,8 +195,8 @@ def _print_averages(data, all: bool) -> None:
 
 
 def _rows(point, all: bool) -> list[list[str]]:
-    """Name, value with error, unit, effective samples and kinetic theory of each average; a name
-    alone is the heading of a group.
+    """Name, value with error, unit and effective samples of each average; a name alone is the
+    heading of a group.
     """
     from jaxgran.maps.schema import path_of, shear_stress_ratio
     from jaxgran.sampling.enskog_factors import LENGTHS
@@ -219,14 +219,14 @@ def _rows(point, all: bool) -> list[list[str]]:
                 continue
             path, unit = path_of(name), unit_text(OBSERVABLES[name].unit)
             value = f"{number(path):.3g}" if group == "diagnostics" else measured(path)
-            known = strain / correlated.get(name, math.nan), number(f"theory/{name}")
-            texts = ["" if math.isnan(x) else f"{x:.3g}" for x in known]
-            rows.append([name.replace("_", " "), value, unit, *texts])
+            samples = strain / correlated.get(name, math.nan)
+            text = "" if math.isnan(samples) else f"{samples:.3g}"
+            rows.append([name.replace("_", " "), value, unit, text])
             if name == "force_ratio":
                 ratio = with_error(*map(float, shear_stress_ratio(point)))
-                rows.append(["shear-stress ratio", ratio, "", "", ""])
+                rows.append(["shear-stress ratio", ratio, "", ""])
             if name == "binary_dissipation_rate":
                 for length in LENGTHS:
                     words = length.replace("_", " ")
-                    rows.append([words, measured(f"theory/{length}"), "σ", "", ""])
+                    rows.append([words, measured(f"theory/{length}"), "σ", ""])
     return rows
