@@ -191,7 +191,7 @@ def made(
         (
             made(-0.05, 0.02, chaos=0.8, pairs=1.1),
             (
-                "pressure by 5.0 ± 2.0 % and the local temperature by 10.0 ± 3.0 %; given",
+                "pressure by 5.0 ± 2.0 % and the local temperature by 10.0 ± 3.0 %. At",
                 "would be 14 % too high",  # 1/(0.8 × 1.1)
                 "correlated (a factor of 0.8)",
                 "binary (force ratio at most 1.001, dt",
@@ -208,12 +208,12 @@ def made(
             made(0.01, 0.02, of_temperature=0.02, anisotropy=1.1, pairs=1.05),
             (
                 "agrees with the pressure (error 1.0 ± 2.0 %) and the local temperature (error 2.0",
-                "furthest from its assumptions, velocities are anisotropic",
+                "violated most: velocities are anisotropic",
             ),
         ),
         (
             made(0.01, 0.02, of_temperature=0.1),
-            ("and overestimates the local temperature by", "would be right; each of its"),
+            ("and overestimates the local temperature by", "would be right. Each of its"),
         ),
         (
             made(-0.9, 0.02, 4.0, binary=8.0, pairs=5.0),

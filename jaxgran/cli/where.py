@@ -166,7 +166,7 @@ def _entries(flow: Validity) -> dict[str, Entry]:
     """The entries of the JSON object."""
     head = shipped_table().head
     entries = {
-        "verdict": Entry(flow.verdict(), "what kinetic theory can predict, in a sentence", None),
+        "verdict": Entry(flow.verdict(), "what kinetic theory can predict, in words", None),
         "restitution": Entry(flow.restitution, "coefficient of restitution"),
         "packing_fraction": Entry(flow.packing_fraction, "packing fraction"),
         "fails_first": Entry(flow.fails_first(), "assumption that is furthest off", None),

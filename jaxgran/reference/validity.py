@@ -116,13 +116,13 @@ class Validity(NamedTuple):
         return Validity(*map(part, self))
 
     def verdict(self) -> Any:
-        """One sentence for every flow: a string, or an array of strings. For values that are known,
-        not traced.
+        """The answer in words for every flow: a string, or an array of strings, not of traced
+        values.
         """
-        sentences = np.empty(np.shape(self.error["pressure"]), object)
-        for place in np.ndindex(sentences.shape):
-            sentences[place] = self.at(place)._sentence()
-        return sentences if sentences.ndim else sentences.item()
+        verdicts = np.empty(np.shape(self.error["pressure"]), object)
+        for place in np.ndindex(verdicts.shape):
+            verdicts[place] = self.at(place)._verdict()
+        return verdicts if verdicts.ndim else verdicts.item()
 
     def rows(self) -> list[list[str]]:
         """The ``COLUMNS`` of every average of one flow, as texts; an average and an error with a 95
@@ -145,7 +145,7 @@ class Validity(NamedTuple):
             rows.append([name.replace("_", " "), interval, theory, *errors])
         return rows
 
-    def _sentence(self) -> str:
+    def _verdict(self) -> str:
         """The verdict on one flow."""
         pressure, of_temperature = map(self._departure, ("pressure", "local_granular_temperature"))
         same = pressure[0] == of_temperature[0]
@@ -158,11 +158,11 @@ class Validity(NamedTuple):
         enskog = enskog if abs(missing) >= 0.5 else "right"
         first = self.fails_first()
         if first == "none":
-            cause = "each of its assumptions holds within 2 %"
+            cause = "Each of its assumptions holds within 2 %"
         else:
             factor = float(self.factors[first])
             cause = (
-                f"furthest from its assumptions, {_CAUSES[first][factor > 1]} (a factor of "
+                f"The assumption that is violated most: {_CAUSES[first][factor > 1]} (a factor of "
                 f"{factor:.3g})"
             )
         ratio, ratio_ci95 = (float(x["force_ratio"]) for x in (self.measured, self.measured_ci95))
@@ -170,13 +170,13 @@ class Validity(NamedTuple):
         step = f"dt = {shipped_table().timestep}/γ̇"
         if off < 0.05:
             most = 1 + float(f"{off:.1g}")
-            binary = f"collisions are binary (force ratio at most {most:g}, {step})"
+            binary = f"Collisions are binary (force ratio at most {most:g}, {step})"
         else:
             explained = f"{100 / ratio:.2g} % of the mean contact force"
-            binary = f"binary collisions explain {explained} ({step})"
+            binary = f"Binary collisions explain {explained} ({step})"
         return (
-            f"{start}; given the measured temperature, Enskog's contact pressure would be "
-            f"{enskog}; {cause}; {binary}."
+            f"{start}. At the measured temperature, Enskog's contact pressure would be {enskog}. "
+            f"{cause}. {binary}."
         )
 
     def _departure(self, name: str) -> tuple[str, str]:
@@ -197,7 +197,7 @@ def validity(restitution: Any, packing_fraction: Any) -> Validity:
       packing_fraction: ν, a number or an array; the two broadcast.
 
     Returns:
-      A ``Validity``, whose ``verdict()`` sums it up in a sentence. Its arrays are of NumPy, or of
+      A ``Validity``, whose ``verdict()`` sums it up in words. Its arrays are of NumPy, or of
       JAX if an argument is traced: ``jax.jit``, ``jax.vmap`` and derivatives apply, in double
       precision only, and the result is NaN outside the measured range.
 
