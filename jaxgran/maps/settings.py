@@ -90,7 +90,7 @@ class MapSettings:
     error: float | None = option(
         None,
         "Relative error of force ratio and stresses to reach at every point, as half of a 95 % "
-        "interval; sets the strain, and what is auto.",
+        "interval; determines the strain, and what is auto.",
         range=_ERROR,
     )
     tolerance: float | None = option(
@@ -139,8 +139,8 @@ class MapSettings:
     )
     diameters: tuple[float, ...] | None = option(
         None,
-        "Diameters, each of as many grains, such as 1,1.4, instead of the uniform distribution; "
-        "their mean is the unit of length.",
+        "Diameters, in equal numbers of grains, such as 1,1.4, instead of the uniform "
+        "distribution; their mean is the unit of length.",
         values=True,
     )
     part: str | None = option(
