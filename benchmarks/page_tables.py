@@ -24,8 +24,7 @@ def variables(group: str) -> str:
     Families of names (of a large system, kinetic theory's predictions, Enskog's factors) have no
     row.
     """
-    header = ("name", "dimensions", "unit", "meaning")
-    rows = []
+    lines = ["| name (dimensions) | unit | meaning |", "| --- | --- | --- |"]
     for row in VARIABLES:
         name = row.path.rpartition("/")[2]
         family = (
@@ -34,11 +33,9 @@ def variables(group: str) -> str:
             or (group == "theory" and name in OBSERVABLES)
         )
         if row.group == group and not family:
-            dims = ", ".join(f"`{dim}`" for dim in row.dims)
-            rows.append((f"`{name}`", dims, unit_of(row.unit), row.meaning))
-    shown = [k for k in range(len(header)) if any(row[k] for row in rows)]
-    lines = [header, ("---",) * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line[k] for k in shown)} |" for line in lines)
+            dims = f" ({', '.join(f'`{dim}`' for dim in row.dims)})" if row.dims else ""
+            lines.append(f"| `{name}`{dims} | {unit_of(row.unit)} | {row.meaning} |")
+    return "\n".join(lines)
 
 
 def table_of(command: str, kind: str) -> Any:
