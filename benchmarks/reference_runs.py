@@ -5,7 +5,7 @@
 102,400 grains, four times as many as any that the law of the size was fitted to, at dt = 3e-4;
 their long waves need a preparation of 250 strains. Nothing is fitted to any of them.
 
-    python -m benchmarks reference_runs               # 20 minutes on one core
+    python -m benchmarks reference_runs               # five minutes on one core
     python -m benchmarks reference_runs --part large  # two hours on two cores
     python -m benchmarks reference_runs --quick       # 3 points of 64 grains, under a minute
 """

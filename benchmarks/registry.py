@@ -108,7 +108,7 @@ BENCHMARKS = (
         "reference_runs",
         "What are stresses and temperatures at random points that no table of `jg.validity` has "
         "seen?",
-        (20, 0.5),
+        (5, 0.5),
         ("reference_runs.json", "reference_runs_large.json"),
         (Option("--part", "random points, or large flows", choices=("random", "large")),),
     ),
