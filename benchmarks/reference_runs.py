@@ -6,7 +6,7 @@
 their long waves need a preparation of 250 strains. Nothing is fitted to any of them.
 
     python -m benchmarks reference_runs               # five minutes on one core
-    python -m benchmarks reference_runs --part large  # two hours on two cores
+    python -m benchmarks reference_runs --part large  # two and a half hours on two cores
     python -m benchmarks reference_runs --quick       # 3 points of 64 grains, under a minute
 """
 
