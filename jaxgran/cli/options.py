@@ -25,7 +25,7 @@ _LISTS = {
     float: f"a list like 0.1,0.5,0.9 or start:stop:count with a count of 2 to {MAX_REPLICAS}",
 }
 FILE = Option("Dataset of a map.", Path)
-QUIET = Option("Print errors only.", bool, short="q")
+QUIET = Option("On standard error, print only what went wrong.", bool, short="q")
 OVERWRITE = Option("Replace an existing file.", bool)
 
 

@@ -139,7 +139,7 @@ class Tally:
         return jax.tree.map(lambda *both: jnp.stack(both), self, other).total(axis=0)
 
     def total(self, axis: int | tuple[int, ...]) -> "Tally":
-        """The tally over all leading axes: sums, and the largest of each of ``EXTREMES``."""
+        """The tally over these axes: sums, and the largest of each of ``EXTREMES``."""
         sums = {name: getattr(self, name) for name in TABLE}
         joined = {
             name: x.max(axis) if name in EXTREMES else x.sum(axis) for name, x in sums.items()

@@ -90,7 +90,7 @@ class MapSettings:
     error: float | None = option(
         None,
         "Relative error of force ratio and stresses to reach at every point, as half of a 95 % "
-        "interval; determines the strain, and what is auto.",
+        "interval; chooses the strain, and grains and time step unless given.",
         range=_ERROR,
     )
     tolerance: float | None = option(

@@ -116,8 +116,8 @@ class Validity(NamedTuple):
         return Validity(*map(part, self))
 
     def verdict(self) -> Any:
-        """The answer in words for every flow: a string, or an array of strings, not of traced
-        values.
+        """The answer in words for every flow: a string, or an array of strings. Values must not
+        be traced.
         """
         verdicts = np.empty(np.shape(self.error["pressure"]), object)
         for place in np.ndindex(verdicts.shape):
@@ -199,7 +199,7 @@ def validity(restitution: Any, packing_fraction: Any) -> Validity:
     Returns:
       A ``Validity``, whose ``verdict()`` sums it up in words. Its arrays are of NumPy, or of
       JAX if an argument is traced: ``jax.jit``, ``jax.vmap`` and derivatives apply, in double
-      precision only, and the result is NaN outside the measured range.
+      precision only, and the result is NaN where a traced value is outside the measured range.
 
     Raises:
       InputError: (a ValueError) a value is outside the measured range, which the message names; or
