@@ -214,23 +214,24 @@ def _print_large_system(data) -> None:
         )
     if not _are_measured(data):
         title += f"\nExtrapolated: the corrections were measured at {MEASURED_FLOWS} only"
-    rows = []
+    predicted, rows = _predicted(data) if point else {}, []
     for name, words in _PRINTED.items():
-        errors = relative_ci95(data, name)
-        at_size, large = data[name].values, data[f"{name}_large_system"].values
+        errors, large = relative_ci95(data, name), data[f"{name}_large_system"].values
         if point:
             total = data[f"{name}_large_system_ci95"].sel(error_source="total").item()
-            cells = [with_error(large.item(), total), _predicted(data, name)]
+            cells = [with_error(large.item(), total), predicted.get(name, "")]
         else:
-            cells = [_percent(large / at_size - 1), _percent(errors["total"])]
+            cells = [_percent(large / data[name].values - 1), _percent(errors["total"])]
         sources = {source: _percent(errors[source]) for source in _SOURCES}
         sources |= {"timestep": "–"} if name == "force_ratio" else {}
         rows.append([words, *cells, *sources.values()])
     print_table(title, ("average", *values, *_SOURCES.values()), rows)
 
 
-def _predicted(data, name: str) -> str:
-    """What kinetic theory predicts for one flow; its temperature is compared with the local one."""
+def _predicted(data) -> dict[str, str]:
+    """What kinetic theory predicts for one flow, none if it is elastic; its temperature is compared
+    with the local one.
+    """
     pressure, shear_stress, temperature = (
         data[f"theory/{x}"].item() for x in ("pressure", "shear_stress", "granular_temperature")
     )
@@ -240,7 +241,7 @@ def _predicted(data, name: str) -> str:
         "local_granular_temperature": temperature,
         "macroscopic_friction": shear_stress / pressure,
     }
-    return f"{values[name]:.3g}" if name in values else ""
+    return {name: f"{value:.3g}" for name, value in values.items() if np.isfinite(value)}
 
 
 def _are_measured(data) -> bool:
