@@ -8,13 +8,13 @@ A grid of restitutions α and packing fractions ν as one batch:
     jax.config.update("jax_enable_x64", True)
     import jaxgran as jg
 
-    jg.use_cache()  # compiled programs are kept on disk
+    jg.use_cache()  # keeps compiled programs on disk
     alphas, nus = jnp.array([(0.3, 0.5), (0.9, 0.5), (0.3, 0.7), (0.9, 0.7)]).T
     flows = jg.ShearFlow(grains=64, restitution=alphas, packing_fraction=nus, timestep=1e-3)
     states = jg.prepare(flows, jax.random.split(jax.random.key(0), len(alphas)))  # until steady
     states, samples = jg.sample(flows, states, strain=5.0)  # or jax.vmap(jg.sample, (0, 0, None))
     for row in zip(alphas, nus, samples.force_ratio, samples.errors()["force_ratio"]):
-        print("α = {:.1f}, ν = {:.1f}: {:.3f} ± {:.3f}".format(*row))
+        print("α = {:g}, ν = {:g}: {:.3f} ± {:.3f}".format(*row))
 
 ================  ==================================================================================
 flow              ShearFlow, State, Grains, own_grains, polydisperse, Status, InputError

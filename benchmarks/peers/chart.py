@@ -74,7 +74,7 @@ def draw(result: dict) -> Figure:
     panels[0].yaxis.set_minor_locator(NullLocator())
     panels[0].yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{100 * x:g} %"))
     figure.supxlabel(
-        "processor time of a grain in a unit of strain (µs); lower left is better",
+        "processor time per grain and unit of strain (µs); lower left is better",
         fontsize=LABEL_SIZE,
     )
     return figure

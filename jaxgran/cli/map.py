@@ -18,7 +18,7 @@ from jaxgran.cli.measure import (
     told_how_to_resume,
 )
 from jaxgran.cli.options import FILE, QUIET, command, of_map
-from jaxgran.cli.output import JSON, print_json, print_table
+from jaxgran.cli.output import JSON, print_json, print_table, print_text
 from jaxgran.cli.terminal import say_cache, say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, refused, short_repr
@@ -130,17 +130,17 @@ def print_tables(data) -> None:
 
     for part in parts(data):
         if np.isfinite(part.force_ratio).any():
-            size = f"{part.attrs['grains']} grains, " if "grains" in part.coords else ""
-            about = (
-                f"{size}dt = {part.attrs['timestep']:g} / shear rate, {part.attrs['activation']} "
-                "activation"
+            size = f"N = {part.attrs['grains']}" if "grains" in part.coords else "N of each point"
+            title = (
+                f"Force ratio by packing fraction ν and restitution α: {size}, dt = "
+                f"{part.attrs['timestep']:g}/γ̇, {part.attrs['activation']} activation"
             )
             half = HALF_INTERVAL * part.force_ratio_stderr
-            title = f"Force ratio by packing fraction ν and restitution α: {about}"
             _print_plane(part, part.force_ratio, half, title)
+            title = f"Pressure of a large system in m/t² (t = 1/γ̇), extrapolated from {size}"
             half = part.pressure_large_system_ci95.sel(error_source="total")
-            title = f"Pressure of a large system in m/t²: {about}"
             _print_plane(part, part.pressure_large_system, half, title)
+    _print_success_of_theory(data)
     print_large_system(data)
 
 
@@ -180,5 +180,17 @@ def _print_plane(data, values, halves, title: str) -> None:
         ]
         rows.append([f"{nu:g}", *cells])
     columns = ["ν", *(f"α = {x:g}" for x in data.restitution.values)]
-    about = "In brackets: 95 % half-width of the last digits. *: bad status."
-    print_table(f"{title}. {about}", columns, rows)
+    about = "In brackets: 95 % half-width of the last digits."
+    mark = " *: bad status." if data.status.any() else ""
+    print_table(f"{title}. {about}{mark}", columns, rows)
+
+
+def _print_success_of_theory(data) -> None:
+    """Print at how many points kinetic theory predicts the pressure within 10 %."""
+    from jaxgran.maps.schema import flattened
+
+    flat = flattened(data)
+    error = (flat["theory/pressure"] / flat.pressure_large_system - 1).values
+    if known := np.isfinite(error).sum():
+        right = (abs(error) <= 0.1).sum()
+        print_text(f"Kinetic theory is within 10 % of this pressure at {right} of {known} points.")

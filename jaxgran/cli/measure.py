@@ -32,7 +32,7 @@ _PRINTED = {
     "shear_stress": "shear stress",
     "granular_temperature": "T",
     "local_granular_temperature": "local T",
-    "macroscopic_friction": "friction",
+    "macroscopic_friction": "friction τ/p",
 }
 _SOURCES = {"sampling": "sampling", "timestep": "dt", "size": "size"}  # of errors above 0.4 %
 _SMALLER = (
@@ -205,7 +205,7 @@ def _print_large_system(data) -> None:
     point = data.status.size == 1
     values = ("large system", "kinetic theory") if point else ("correction", "total")
     if point:
-        size = f" from N = {data.attrs['grains']}" if "grains" in data.attrs else ""
+        size = f" extrapolated from N = {data.attrs['grains']}" if "grains" in data.attrs else ""
         title = f"Averages of a large system{size}, ± 95 %; parts of the errors in %"
     else:
         title = (

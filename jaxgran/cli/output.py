@@ -29,7 +29,16 @@ from jaxgran.maps.options import Option
 
 JSON = Option("Print one JSON object instead of tables.", bool)
 _IN_ASCII = str.maketrans(
-    {"±": "+-", "σ": "sigma", "γ": "gamma", "\u0307": "-dot", "ν": "nu", "α": "alpha", "²": "^2"}
+    {
+        "±": "+-",
+        "σ": "sigma",
+        "τ": "tau",
+        "γ": "gamma",
+        "\u0307": "-dot",
+        "ν": "nu",
+        "α": "alpha",
+        "²": "^2",
+    }
     | {"–": "-", "−": "-", "×": "x", "…": "...", "’": "'"}
 )
 

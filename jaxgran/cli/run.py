@@ -177,7 +177,7 @@ def _print_averages(data, all: bool) -> None:
     points = [part.isel(packing_fraction=0, restitution=0) for part in parts(data)]
     sizes = [f"N = {point.attrs['grains']}" for point in points]
     title = (
-        f"{', '.join(sizes)}; dt = {data.attrs['timestep']:g} / shear rate, "
+        f"Averages at {', '.join(sizes)}, dt = {data.attrs['timestep']:g}/γ̇, "
         f"{data.attrs['activation']} activation\n"
         f"engine {data.attrs['engine']}, solver {data.attrs['solver']}"
     )

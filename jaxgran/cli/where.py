@@ -14,7 +14,7 @@ from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError
 from jaxgran.model.display import in_brackets, with_error
 from jaxgran.reference.table import MEASURED, THEORIES, shipped_table
-from jaxgran.reference.validity import COLUMNS, Validity, validity
+from jaxgran.reference.validity import ASSUMPTIONS, COLUMNS, Validity, validity
 
 WHERE_EXAMPLES = {
     "Error of kinetic theory at a restitution and a packing fraction": "jaxgran where "
@@ -44,13 +44,6 @@ WHERE_OPTIONS = {
     "overwrite": OVERWRITE,
 }
 _UNITS = MEASURED | {"force_ratio": "1"}
-_ASSUMPTIONS = {
-    "local_temperature": "the granular temperature is that of neighbours",
-    "anisotropy": "velocities are isotropic",
-    "chaos": "velocities of colliding grains are independent",
-    "pairs": "pairs at contact are those of equilibrium",
-    "binary": "collisions are binary",
-}
 _FACTORS = "Enskog's contact pressure at the measured granular temperature"
 
 
@@ -104,7 +97,7 @@ def _print_point(flow: Validity, factors: bool, corrected: bool) -> None:
     about = f"{pair}; ± 95 %; units of m, σ and 1/γ̇"
     print_table(about, COLUMNS[:columns], (row[:columns] for row in flow.rows()))
     if factors:
-        rows = [*zip(_ASSUMPTIONS.values(), _factors(flow, with_error), strict=True)]
+        rows = [*zip(ASSUMPTIONS.values(), _factors(flow, with_error), strict=True)]
         rows.append(("all of these", f"{float(flow.over_enskog()):#.3g}"))
         print_table(_FACTORS, ("assumed", "factor if measured instead"), rows)
     _print_source()
@@ -132,14 +125,14 @@ def _print_plane(flow: Validity, factors: bool, corrected: bool) -> None:
     columns = ("α", "ν", "force ratio", "pressure", *names, "fails first")
     print_table(f"Error of kinetic theory in the pressure. {about}.", columns, rows)
     if factors:
-        names = (name.replace("_", " ") for name in _ASSUMPTIONS)
+        names = (name.replace("_", " ") for name in ASSUMPTIONS)
         print_table(f"Factors of {_FACTORS}. {about}.", ("α", "ν", *names), factor_rows)
     _print_source()
 
 
 def _factors(flow: Validity, text: Callable[[float, float], str]) -> list[str]:
     """The factor of every assumption, with its interval."""
-    return [text(float(flow.factors[x]), float(flow.factors_ci95[x])) for x in _ASSUMPTIONS]
+    return [text(float(flow.factors[x]), float(flow.factors_ci95[x])) for x in ASSUMPTIONS]
 
 
 def _print_source() -> None:
@@ -188,7 +181,7 @@ def _entries(flow: Validity) -> dict[str, Entry]:
     for group, values, half_widths, meaning in groups:
         for name, value in values.items():
             unit = _UNITS[name] if group in ("", "theory/", "corrected/") else "1"
-            words = meaning + _ASSUMPTIONS.get(name, "")
+            words = meaning + ASSUMPTIONS.get(name, "")
             entries[group + name] = Entry(value, words, unit, ci95=half_widths.get(name))
     grains = head["grains"]  # a number, or in words where it depends on the flow
     entries["grains"] = Entry(

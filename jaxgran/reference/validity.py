@@ -27,17 +27,16 @@ from jaxgran.reference.table import (
 COLUMNS = ("average", "measured", "theory", "error", "error if corrected")
 """What ``Validity.rows`` gives of every average."""
 
-_NEGLIGIBLE = 0.02  # a factor of the contact pressure this close to one is not said to fail
-_CAUSES = {  # what is said where a factor is below one, and where it is above
-    "local_temperature": ("long waves of velocity raise the granular temperature",) * 2,
-    "anisotropy": ("velocities are anisotropic",) * 2,
-    "chaos": ("velocities of colliding grains are correlated",) * 2,
-    "pairs": (
-        "fewer pairs are at contact than in equilibrium",
-        "more pairs are at contact than in equilibrium",
-    ),
-    "binary": ("grains collide in clusters",) * 2,
+ASSUMPTIONS = {
+    "local_temperature": "the granular temperature is that of neighbours",
+    "anisotropy": "velocities are isotropic",
+    "chaos": "velocities of colliding grains are independent",
+    "pairs": "pairs at contact are those of equilibrium",
+    "binary": "collisions are binary",
 }
+"""What the theory assumes, by the name of its factor."""
+
+_NEGLIGIBLE = 0.02  # a factor of the contact pressure this close to one is not said to fail
 
 
 class Validity(NamedTuple):
@@ -153,18 +152,13 @@ class Validity(NamedTuple):
             f"Kinetic theory {pressure[0]} the pressure{pressure[1]} and "
             f"{'' if same else of_temperature[0] + ' '}the local temperature{of_temperature[1]}"
         )
-        missing = 100 * (1 / float(self.over_enskog()) - 1)
-        enskog = f"{abs(missing):.2g} % too {'high' if missing > 0 else 'low'}"
-        enskog = enskog if abs(missing) >= 0.5 else "right"
         first = self.fails_first()
-        if first == "none":
-            cause = "Each of its assumptions holds within 2 %"
-        else:
-            factor = float(self.factors[first])
-            cause = (
-                f"The assumption that is violated most: {_CAUSES[first][factor > 1]} (a factor of "
-                f"{factor:.3g})"
-            )
+        cause = (
+            "Each of its assumptions holds within 2 %; all together leave Enskog's contact pressure"
+            if first == "none"
+            else f"The assumption that is violated most is that {ASSUMPTIONS[first]}: by itself it "
+            f"makes Enskog's contact pressure {_too(self.factors[first])}; all together leave it"
+        )
         ratio, ratio_ci95 = (float(x["force_ratio"]) for x in (self.measured, self.measured_ci95))
         off = max(ratio - 1, 0.0) + ratio_ci95
         step = f"dt = {shipped_table().timestep}/γ̇"
@@ -174,10 +168,7 @@ class Validity(NamedTuple):
         else:
             explained = f"{100 / ratio:.2g} % of the mean contact force"
             binary = f"Binary collisions explain {explained} ({step})"
-        return (
-            f"{start}. At the measured temperature, Enskog's contact pressure would be {enskog}. "
-            f"{cause}. {binary}."
-        )
+        return f"{start}. {cause} {_too(self.over_enskog())} at the measured temperature. {binary}."
 
     def _departure(self, name: str) -> tuple[str, str]:
         """What the theory does with an average: a verb, and by how much."""
@@ -186,6 +177,14 @@ class Validity(NamedTuple):
             return "agrees with", f" (error {with_error(error, ci95)} %)"
         side = "over" if error > 0 else "under"
         return f"{side}estimates", f" by {with_error(abs(error), ci95)} %"
+
+
+def _too(factor: Any) -> str:
+    """By how much a pressure is off that has to be multiplied by a factor to be right."""
+    percent = 100 * (1 / float(factor) - 1)
+    if abs(percent) < 0.5:
+        return "right"
+    return f"{float(f'{abs(percent):.2g}'):g} % too {'high' if percent > 0 else 'low'}"
 
 
 def validity(restitution: Any, packing_fraction: Any) -> Validity:
