@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
         redraw(chosen.pictures, chosen.output)
         return
-    benchmark = next((one for one in BENCHMARKS if one.name == chosen.name), None)
+    benchmark = next((known for known in BENCHMARKS if known.name == chosen.name), None)
     set_up(benchmark is not None and benchmark.one_core)
     from benchmarks.output import RESULTS, Output, refusal
 
@@ -132,7 +132,7 @@ def parser() -> argparse.ArgumentParser:
         help="folder [default: benchmarks/results]",
     )
     for benchmark in BENCHMARKS:
-        one = names.add_parser(
+        subparser = names.add_parser(
             benchmark.name,
             parents=[shared],
             help=benchmark.question.replace("%", "%%"),
@@ -141,10 +141,10 @@ def parser() -> argparse.ArgumentParser:
         )
         for option in benchmark.options:
             if option.kind is bool:
-                one.add_argument(option.name, action="store_true", help=option.help)
+                subparser.add_argument(option.name, action="store_true", help=option.help)
             else:
                 place = {} if option.name.startswith("-") else {"nargs": "?"}
-                one.add_argument(
+                subparser.add_argument(
                     option.name, type=option.kind, choices=option.choices, help=option.help, **place
                 )
     return main_parser

@@ -139,10 +139,10 @@ def run(output: Output) -> None:
         "discs      α   steps with contacts, at most   steps that a decade adds   exponent of the "
         "excess"
     )
-    for one in rows:
+    for row in rows:
         print(
-            f"{one['discs']:5d}{one['restitution']:7g}   "
-            + "   ".join(table_cell(law, one.get(law)) for law in LAWS)
+            f"{row['discs']:5d}{row['restitution']:7g}   "
+            + "   ".join(table_cell(law, row.get(law)) for law in LAWS)
         )
     choices = {
         "first_gap": GAP,
@@ -173,19 +173,19 @@ def study(discs: int, restitution: float, gaps: np.ndarray) -> dict:
     steps, excess = np.stack(
         [steps_and_excess(restitution, dt, states) for dt in TIMESTEPS], axis=1
     )
-    found = {"discs": discs, "restitution": restitution}
+    result = {"discs": discs, "restitution": restitution}
     for name, values in (("steps", steps), ("excess", excess)):
-        found[name] = list(values.mean(axis=1))
-        found[f"{name}_error"] = list(values.std(axis=1, ddof=1) / np.sqrt(len(gaps)))
+        result[name] = list(values.mean(axis=1))
+        result[f"{name}_error"] = list(values.std(axis=1, ddof=1) / np.sqrt(len(gaps)))
     if restitution > THRESHOLDS[discs]:
-        return found | {"most_steps": (float(steps.max()), most_collisions(discs, restitution))}
+        return result | {"most_steps": (float(steps.max()), most_collisions(discs, restitution))}
     exact = roots(discs, restitution)
     for name, values in zip(
         ("steps_per_decade", "exponent"), slopes(exact, restitution, states), strict=True
     ):
         error = values.std(ddof=1) / np.sqrt(len(gaps))
-        found[name] = (float(values.mean()), float(error), float(getattr(exact, name)))
-    return found
+        result[name] = (float(values.mean()), float(error), float(getattr(exact, name)))
+    return result
 
 
 def slopes(

@@ -81,7 +81,7 @@ def run(output: Output) -> None:
     matches = [
         match
         for row in grains
-        for match in matched(row, [one for one in discs if one["flow"] == row["flow"]])
+        for match in matched(row, [disc for disc in discs if disc["flow"] == row["flow"]])
     ]
     powers = [
         fitted(rows, flow, name)
@@ -113,7 +113,7 @@ def event_driven(flow: Flow, runs: Runs, durations: tuple[float, ...]) -> list[d
             sample.append(sums)
     rows = []
     for sample, duration in zip(samples, durations, strict=True):
-        sums = {name: np.stack([one[name] for one in sample]) for name in sample[0]}
+        sums = {name: np.stack([part[name] for part in sample]) for name in sample[0]}
         value, error = standard_errors(lambda x: averages(x, discs), sums)
         rows.append(
             {"flow": list(flow), "time": duration}
@@ -136,10 +136,10 @@ def stepped(plan: Plan) -> list[dict]:
     )
     rows = []
     for nu, alpha, dt in product(plan.packing_fraction, plan.restitution, plan.timesteps):
-        here = data.sel(packing_fraction=nu, restitution=alpha, timestep=dt)
-        row = {x: [float(here[f"{path_of(x)}{end}"]) for end in ("", "_stderr")] for x in STEPPED}
+        flow = data.sel(packing_fraction=nu, restitution=alpha, timestep=dt)
+        row = {x: [float(flow[f"{path_of(x)}{end}"]) for end in ("", "_stderr")] for x in STEPPED}
         rows.append(
-            {"flow": [nu, alpha], "time": dt, "status": jg.Status(int(here.status)).name} | row
+            {"flow": [nu, alpha], "time": dt, "status": jg.Status(int(flow.status)).name} | row
         )
     return rows
 
@@ -151,7 +151,7 @@ def matched(row: dict, discs: list[dict]) -> list[dict]:
     Logarithms are interpolated between durations. The quotient is None where no two durations
     enclose the value.
     """
-    found = []
+    matches = []
     for name, other in MATCHED.items():
         value, error = row[name]
         match = {
@@ -161,22 +161,22 @@ def matched(row: dict, discs: list[dict]) -> list[dict]:
             "quotient": None,
             "relative_error": None,
         }
-        ordered = sorted(discs, key=lambda one: one["time"])
-        for one, two in pairwise(ordered):
-            (low, low_error), (high, high_error) = one[other], two[other]
+        ordered = sorted(discs, key=lambda disc: disc["time"])
+        for shorter, longer in pairwise(ordered):
+            (low, low_error), (high, high_error) = shorter[other], longer[other]
             if min(low, value, high) > 0 and min(low, high) <= value < max(low, high):
-                slope = np.log(high / low) / np.log(two["time"] / one["time"])
+                slope = np.log(high / low) / np.log(longer["time"] / shorter["time"])
                 share = np.log(value / low) / np.log(high / low)
                 spread = np.hypot(
                     error / value, (1 - share) * low_error / low + share * high_error / high
                 )
                 match["quotient"] = float(
-                    one["time"] * np.exp(np.log(value / low) / slope) / row["time"]
+                    shorter["time"] * np.exp(np.log(value / low) / slope) / row["time"]
                 )
                 match["relative_error"] = float(spread / abs(slope))
                 break
-        found.append(match)
-    return found
+        matches.append(match)
+    return matches
 
 
 def fitted(rows: list[dict], flow: Flow, name: str) -> dict:
@@ -190,31 +190,31 @@ def fitted(rows: list[dict], flow: Flow, name: str) -> dict:
     ]
     times, value, error = np.array([(row["time"], *row[name]) for row in some]).T
     value = value - (name == "force_ratio")
-    found = {"flow": flow, "observable": name, "exponent": None, "error": None}
+    result = {"flow": flow, "observable": name, "exponent": None, "error": None}
     if np.all(value > 0) and np.all(error > 0):
         place, weight = np.log(times), value / error
         powers, covariance = np.polyfit(place, np.log(value), 1, w=weight, cov="unscaled")
         chi2 = np.sum((weight * (np.log(value) - np.polyval(powers, place))) ** 2) / max(
             1, len(some) - 2
         )
-        found |= {
+        result |= {
             "exponent": float(powers[0]),
             "error": float(np.sqrt(covariance[0, 0] * max(1.0, chi2))),
         }
-    return found
+    return result
 
 
 def report(matches: list[dict], powers: list[dict]) -> None:
     """Print the quotients t_c/dt and the exponents of all flows."""
     print("t_c/dt of equal    collision rate         share of the pressure")
-    for one, two in zip(matches[::2], matches[1::2], strict=True):
+    for rates, shares in zip(matches[::2], matches[1::2], strict=True):
         texts = (
             f"{m['quotient']:9.3g} ± {100 * m['relative_error']:3.0f} %"
             if m["quotient"]
             else f"{'–':>17}"
-            for m in (one, two)
+            for m in (rates, shares)
         )
-        print("ν {:4g}  α {:3g}".format(*one["flow"]), f"dt {one['timestep']:6g}", *texts)
+        print("ν {:4g}  α {:3g}".format(*rates["flow"]), f"dt {rates['timestep']:6g}", *texts)
     print(
         "exponents of",
         *(f"{name:>24}" for name in (*OF_DISCS, *OF_GRAINS)),
@@ -247,10 +247,10 @@ def draw(discs: list[dict], grains: list[dict]) -> Figure:
     )
     for axes, (name, (title, label)) in zip(figure.subplots(1, 2), panels.items(), strict=True):
         for rows, source, look, face in sources:
-            here = [row for row in rows if row["flow"] == flow]
-            value, error = np.array([row[name] for row in here]).T
+            rows_of_flow = [row for row in rows if row["flow"] == flow]
+            value, error = np.array([row[name] for row in rows_of_flow]).T
             axes.errorbar(
-                [row["time"] for row in here],
+                [row["time"] for row in rows_of_flow],
                 value,
                 error,
                 fmt=look,

@@ -110,7 +110,7 @@ def flow_rows(plan: Plan, alpha: float, nu: float, rng: np.random.Generator) -> 
             if 2 * seeds > plan.repeats:
                 continue
             groups = [group for _ in range(seeds) for group in divided(rng, plan.repeats, seeds)]
-            estimates = [standard_errors(average, picked(tally, one)) for one in groups]
+            estimates = [standard_errors(average, picked(tally, group)) for group in groups]
             head = {
                 "restitution": alpha,
                 "packing_fraction": nu,
@@ -156,12 +156,12 @@ def judge_error(output: Output, error: float) -> None:
             )  # the share of those that reached their longest strain is printed
             maps.append(jg.ratio_map(*ERROR_PLANE, **given, first_seed=ERROR_SEEDS * repeat))
         print(f"repeat {repeat + 1} of {count}: {time.perf_counter() - start:.0f} s", flush=True)
-    strain = np.stack([one["sums/strain"].sum("seed") for one in maps])
-    limited = np.mean([one["sums/status"] == Status.imprecise for one in maps])
+    strain = np.stack([data["sums/strain"].sum("seed") for data in maps])
+    limited = np.mean([data["sums/status"] == Status.imprecise for data in maps])
     rows = []
     for name in ERROR_OBSERVABLES:
         values, errors = (
-            np.stack([one[f"{name}{end}"] for one in maps]) for end in ("", "_stderr")
+            np.stack([data[f"{name}{end}"] for data in maps]) for end in ("", "_stderr")
         )
         truth = np.sum(strain * values, axis=0) / np.sum(strain, axis=0)
         deviations = np.abs(values - truth) / np.sqrt(1 - 1 / count)
@@ -239,8 +239,8 @@ def divided(rng: np.random.Generator, repeats: int, seeds: int) -> np.ndarray:
 
 
 def chosen_averages(tally: Tally, **flow: float) -> dict[str, np.ndarray]:
-    found = averages(tally, **flow)
-    return {name: np.asarray(found[name]) for name in OBSERVABLES}
+    values = averages(tally, **flow)
+    return {name: np.asarray(values[name]) for name in OBSERVABLES}
 
 
 def means_over_flows(rows: list[dict]) -> Iterator[dict]:

@@ -74,7 +74,7 @@ def compare(flow: jg.ShearFlow, replicas: int) -> dict:
             state := forward(flow, state, jnp.int32(apart))[0]
             for _ in range(min(DISTINCT, replicas))
         ]
-        tallies = [forward(flow, one, jnp.int32(steps))[1] for one in distinct]
+        tallies = [forward(flow, state, jnp.int32(steps))[1] for state in distinct]
         distinct, tallies = jax.device_get((distinct, tallies))
     which = np.arange(replicas) % len(distinct)
     batch = jax.tree.map(lambda *x: np.stack(x)[which], *distinct)
@@ -99,13 +99,13 @@ def compare(flow: jg.ShearFlow, replicas: int) -> dict:
             result = jax.block_until_ready(call())
             seconds[name].append(time.perf_counter() - start)
             if name == "device":
-                found = pressure(result[1], flow, distinct[0])[: len(distinct)]
+                on_device = pressure(result[1], flow, distinct[0])[: len(distinct)]
     speeds = {name: done / min(seconds[name][1:]) for name, (_, done) in ways.items()}
     return {
         "engine": select_engine(flow, DEFAULT_NUMERICS).name,
         **speeds,
         "ratio": speeds["device"] / speeds["rival"],
-        "pressure": float(np.mean(found) / np.mean(pressures)),
+        "pressure": float(np.mean(on_device) / np.mean(pressures)),
         "compilation": seconds["device"][0] - min(seconds["device"][1:]),
     }
 

@@ -86,7 +86,7 @@ def run(output: Output) -> None:
     plane = reference_points()
     another = jg.ratio_map(**JUDGED | (SMALLER if output.quick else {}), workers=usable_cores())
     maps = {"map": plane, "paper": jg.open_map(RESULTS / "paper.nc"), "judged_on": another}
-    points, paper, judged = (compared(flattened(one)) for one in maps.values())
+    points, paper, judged = (compared(flattened(data)) for data in maps.values())
     result = {
         "counts": counts(points),
         "counts_of_paper": counts(paper),
@@ -95,8 +95,8 @@ def run(output: Output) -> None:
         "laws": laws_of_length(points, judged),
         "corrected_theory": corrected_theory(points, {"paper": paper, "judged_on": judged}),
     }
-    for name, one in result.items():
-        print(name, *(f"  {key}: {rounded(x, 4)}" for key, x in one.items()), sep="\n")
+    for name, values in result.items():
+        print(name, *(f"  {key}: {rounded(x, 4)}" for key, x in values.items()), sep="\n")
     print("   ν     α        Γ/Γ_E             L′           L′√chaos   binary   chaos")
     rows, paper_rows, judged_rows = (
         [
@@ -105,19 +105,20 @@ def run(output: Output) -> None:
         ]
         for some in (points, paper, judged)
     )
-    for one in rows:
+    for row in rows:
         print(
             "{nu:5.2f}{alpha:6.2f}{dissipation:8.3f} ± "
             "{dissipation_error:.3f}{length_from_pressure:9.3f} ± "
             "{length_from_pressure_error:.3f}{times_root_chaos:9.3f}{binary:9.3f}"
-            "{chaos:8.3f}".format(**one)
+            "{chaos:8.3f}".format(**row)
         )
     heads = {
-        name: {"points": some["nu"].size, "timestep": float(one.attrs["timestep"])} | sizes_of(one)
-        for (name, one), some in zip(maps.items(), (points, paper, judged), strict=True)
+        name: {"points": some["nu"].size, "timestep": float(data.attrs["timestep"])}
+        | sizes_of(data)
+        for (name, data), some in zip(maps.items(), (points, paper, judged), strict=True)
     }
-    content = heads | rounded(result, 4) | {"judged_points": [keep(one) for one in judged_rows]}
-    content |= {"paper_points": [{name: one[name] for name in LENGTHS} for one in paper_rows]}
+    content = heads | rounded(result, 4) | {"judged_points": [keep(row) for row in judged_rows]}
+    content |= {"paper_points": [{name: row[name] for name in LENGTHS} for row in paper_rows]}
     output.write_rows("dissipation", content, "points", rows)
     output.write_picture(draw(points, judged, fitted_laws(points)[0]), "dissipation")
 
@@ -208,18 +209,18 @@ def errors_of_theory(points: Points) -> dict:
     both are related.
     """
     names = (*(f"{name}_over_theory" for name in THEORY), "local_temperature_over_theory")
-    found: dict = {
+    errors: dict = {
         name: [int(np.sum(abs(1 / points[name] - 1) < share)) for share in WITHIN] for name in names
     }
     moderate = (points["nu"] >= MODERATE[0]) & (points["nu"] <= MODERATE[1])
     for name in ("pressure_over_theory", "shear_stress_over_theory"):
-        x, y = (-np.log(points[one][moderate]) for one in ("local_temperature_over_theory", name))
+        x, y = (-np.log(points[key][moderate]) for key in ("local_temperature_over_theory", name))
         slope, _ = np.polyfit(x, y, 1)
-        found[f"{name}_against_local_temperature"] = {
+        errors[f"{name}_against_local_temperature"] = {
             "correlation": np.corrcoef(x, y)[0, 1],
             "slope": slope,
         }
-    return found
+    return errors
 
 
 # -----------------------------------------------------------------------------------------------
@@ -254,8 +255,8 @@ def laws_of_length(points: Points, judged: Points) -> dict[str, dict]:
     """Coefficients of each law, and the rms of its error in ln L: fitted, with a packing fraction
     left out, judged.
     """
-    points, judged = (only(one, one["nu"] <= DENSEST) for one in (points, judged))
-    found = {}
+    points, judged = (only(flows, flows["nu"] <= DENSEST) for flows in (points, judged))
+    result = {}
     for name, (law, start) in LAWS.items():
         coefficients = fitted(law, start, points)
         left_out = [
@@ -266,13 +267,13 @@ def laws_of_length(points: Points, judged: Points) -> dict[str, dict]:
             )
             for nu in np.unique(points["nu"])
         ]
-        found[name] = {
+        result[name] = {
             "coefficients": coefficients.tolist(),
             "rms": rms(misfit(law, coefficients, points)),
             "rms_left_out": rms(np.concatenate(left_out)),
             "rms_judged": rms(misfit(law, coefficients, judged)),
         }
-    return found
+    return result
 
 
 def only(points: Points, chosen: np.ndarray) -> Points:
@@ -313,11 +314,11 @@ def fitted_laws(points: Points) -> tuple[CorrelationLaws, dict[str, float]]:
         ) -> np.ndarray:
             return roots * law_misfit(laws, points, name, coefficients)
 
-        found = least_squares(weighted, START[name], x_scale="jac", bounds=(0, np.inf))
-        scatter = found.fun @ found.fun / (found.fun.size - found.x.size)
-        stderr = np.sqrt(np.diag(scatter * np.linalg.inv(found.jac.T @ found.jac)))
-        rms_of[name] = rms(found.fun / roots)
-        laws = replace(laws, **{name: found.x, f"{name}_stderr": stderr})
+        fit = least_squares(weighted, START[name], x_scale="jac", bounds=(0, np.inf))
+        scatter = fit.fun @ fit.fun / (fit.fun.size - fit.x.size)
+        stderr = np.sqrt(np.diag(scatter * np.linalg.inv(fit.jac.T @ fit.jac)))
+        rms_of[name] = rms(fit.fun / roots)
+        laws = replace(laws, **{name: fit.x, f"{name}_stderr": stderr})
     return laws, rms_of
 
 
@@ -325,11 +326,11 @@ def areas(alphas: np.ndarray, nus: np.ndarray) -> np.ndarray:
     """The area of the plane of ln(1 − α) and ν that each point of a grid stands for, over the
     mean.
     """
-    found = np.ones(nus.size)
+    area = np.ones(nus.size)
     for x in (-np.log(1 - alphas), nus):
         values, place = np.unique(x, return_inverse=True)
-        found *= np.gradient(values)[place]
-    return found / found.mean()
+        area *= np.gradient(values)[place]
+    return area / area.mean()
 
 
 def law_misfit(
@@ -356,7 +357,7 @@ def corrected_theory(points: Points, others: dict[str, Points]) -> dict:
     """
     laws, of_fit = fitted_laws(points)
     judged = others["judged_on"]
-    found: dict = {
+    result: dict = {
         "laws": {
             **{
                 name: np.asarray(getattr(laws, name)).tolist()
@@ -385,8 +386,8 @@ def corrected_theory(points: Points, others: dict[str, Points]) -> dict:
             )
             for x in values
         ]
-        found[f"rms_{kind}"] = {
-            name: rms(np.concatenate([one[name] for one in left_out])) for name in left_out[0]
+        result[f"rms_{kind}"] = {
+            name: rms(np.concatenate([misfit[name] for misfit in left_out])) for name in left_out[0]
         }
     none = np.zeros(3)
     variants = {
@@ -397,20 +398,20 @@ def corrected_theory(points: Points, others: dict[str, Points]) -> dict:
     }
     for name, some in {"fitted_map": points, **others}.items():
         within = {"all": some["nu"] > 0, "to_0.75": some["nu"] <= DENSEST, "core": in_core(some)}
-        errors = {key: misfits(one, some) for key, one in variants.items()}
-        found[name] = {
+        errors = {key: misfits(variant, some) for key, variant in variants.items()}
+        result[name] = {
             part: {"points": int(chosen.sum())}
             | {
                 key: {
-                    quantity: summary(one[quantity][chosen])
+                    quantity: summary(error[quantity][chosen])
                     for quantity in PREDICTED
-                    if quantity in one
+                    if quantity in error
                 }
-                for key, one in errors.items()
+                for key, error in errors.items()
             }
             for part, chosen in within.items()
         }
-    return found
+    return result
 
 
 def in_core(points: Points) -> np.ndarray:
@@ -481,8 +482,8 @@ def draw(points: Points, judged: Points, laws: CorrelationLaws) -> Figure:
         law = np.asarray(correlation_length(laws, np.full_like(dense, alpha), dense))
         left.plot(dense, law, color=style["color"], linestyle="-", linewidth=1)
     none = replace(laws, length=np.zeros(3), pairs=np.zeros(3))
-    for label, one, face in (("Enskog", none, "none"), ("corrected", laws, "0")):
-        ratio = np.exp(misfits(one, judged)["pressure"])
+    for label, applied, face in (("Enskog", none, "none"), ("corrected", laws, "0")):
+        ratio = np.exp(misfits(applied, judged)["pressure"])
         shift = 0.004 if face == "none" else -0.004
         right.plot(
             judged["nu"] + shift,

@@ -104,21 +104,23 @@ def samples(plan: Plan, task: tuple[int, tuple[float, float], int]) -> dict[floa
     steady = state = jg.prepare(
         jg.ShearFlow(grains, alpha, nu, START), jax.random.key(seed), equilibrate=strain
     )
-    found = {}
+    sampled = {}
     for timestep in timesteps(plan, grains):
         flow = jg.ShearFlow(grains, alpha, nu, timestep)
         before = steady if timestep >= START else state
         relaxed, _ = advance(flow, before, jnp.int32(round(RELAXATION / timestep)))
         state, sample = jg.sample(flow, relaxed, 2 * sqrt(grains))
-        found[timestep] = jax.tree.map(np.asarray, sample)
-    return found
+        sampled[timestep] = jax.tree.map(np.asarray, sample)
+    return sampled
 
 
 def row(flow: jg.ShearFlow, seeds: list[jg.Sample]) -> dict:
     """The factors of one flow with their standard errors, and what else is known of it."""
     value, error = (
-        found | more
-        for found, more in zip(measured_over_enskog(flow, seeds), estimates(seeds), strict=True)
+        measured | estimate
+        for measured, estimate in zip(
+            measured_over_enskog(flow, seeds), estimates(seeds), strict=True
+        )
     )
     warm = value["local_granular_temperature"] / value["granular_temperature"]
     numbers = {"force_ratio": [value["force_ratio"], error["force_ratio"]]}
@@ -137,12 +139,12 @@ def row(flow: jg.ShearFlow, seeds: list[jg.Sample]) -> dict:
     }
 
 
-def line(one: dict) -> str:
+def line(row: dict) -> str:
     """A row as it is printed."""
-    factors = "".join("{:8.3f} ± {:.3f}".format(*one[f"pressure_{factor}"]) for factor in FACTORS)
-    begin = "{alpha:4g} {nu:4g} {grains:5d} {timestep:7g}  {status:12s}".format(**one)
-    warm = one["local_over_granular_temperature"]
-    return begin + "{:8.3f} ± {:.3f}".format(*one["force_ratio"]) + f"{warm:8.2f} {factors}"
+    factors = "".join("{:8.3f} ± {:.3f}".format(*row[f"pressure_{factor}"]) for factor in FACTORS)
+    begin = "{alpha:4g} {nu:4g} {grains:5d} {timestep:7g}  {status:12s}".format(**row)
+    warm = row["local_over_granular_temperature"]
+    return begin + "{:8.3f} ± {:.3f}".format(*row["force_ratio"]) + f"{warm:8.2f} {factors}"
 
 
 @styled
@@ -157,15 +159,15 @@ def draw(plan: Plan, rows: list[dict]) -> Figure:
         for axes, (x, fixed, at) in zip(panels, sides, strict=True):
             for flow, style in zip(plan.flows, curve_styles(len(plan.flows)), strict=True):
                 some = [
-                    one for one in rows if (one["alpha"], one["nu"]) == flow and one[fixed] == at
+                    row for row in rows if (row["alpha"], row["nu"]) == flow and row[fixed] == at
                 ]
-                places = [one[x] for one in some]
-                value, error = np.array([one[f"pressure_{factor}"] for one in some]).T
+                places = [row[x] for row in some]
+                value, error = np.array([row[f"pressure_{factor}"] for row in some]).T
                 label = f"α = {flow[0]:g}, ν = {flow[1]:g}"
                 axes.errorbar(
                     places, value, error, **style, markersize=4, linewidth=1, capsize=2, label=label
                 )
-                bad = np.array([one["status"] != "ok" for one in some])
+                bad = np.array([row["status"] != "ok" for row in some])
                 if bad.any():
                     axes.plot(
                         np.array(places)[bad],

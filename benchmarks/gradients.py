@@ -56,12 +56,12 @@ def cost(grains: int, alpha: float, nu: float) -> dict:
         return jnp.sum(end.velocities**2)
 
     at = (jnp.asarray(alpha), state.velocities)
-    one = (jnp.ones(()), jnp.zeros_like(state.velocities))
+    tangents = (jnp.ones(()), jnp.zeros_like(state.velocities))
     gradient = jax.value_and_grad(energy, argnums=(0, 1))
     routes = {
         "advance": jax.jit(lambda *x: energy(*x, None)),
         "advance of fixed length": jax.jit(lambda *x: energy(*x, events)),
-        "tangent": jax.jit(lambda *x: jax.jvp(lambda *y: energy(*y, None), x, one)),
+        "tangent": jax.jit(lambda *x: jax.jvp(lambda *y: energy(*y, None), x, tangents)),
         "gradient": jax.jit(lambda *x: gradient(*x, events)),
     }
     compile_seconds = {name: elapsed(route, *at) for name, route in routes.items()}

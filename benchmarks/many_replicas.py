@@ -34,7 +34,7 @@ def by_map(engine):
     """The advance of a batch by ``lax.map``."""
 
     def batched(flows, states, steps):
-        return lax.map(lambda one: jg.advance(*one, steps, engine=engine), (flows, states))
+        return lax.map(lambda replica: jg.advance(*replica, steps, engine=engine), (flows, states))
 
     return batched
 

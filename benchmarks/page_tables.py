@@ -53,18 +53,18 @@ def options(command: str) -> str:
 
 def option_rows(command: str) -> list[str]:
     rows = []
-    for name, one in table_of(command, "OPTIONS").items():
-        flag = f"-{one.short}, {option_name(name)}" if one.short else option_name(name)
-        meaning = with_options(one.help, parameters(command))
-        meaning += f" In {one.unit}." if one.unit else ""
-        if isinstance(one.kind, tuple):
+    for name, option in table_of(command, "OPTIONS").items():
+        flag = f"-{option.short}, {option_name(name)}" if option.short else option_name(name)
+        meaning = with_options(option.help, parameters(command))
+        meaning += f" In {option.unit}." if option.unit else ""
+        if isinstance(option.kind, tuple):
             flag += " NAME"
-            meaning += f" One of {', '.join(f'`{choice}`' for choice in one.kind)}."
-        elif one.kind is not bool:
-            flag = f"{flag} {one.placeholder}".replace("|auto", " or auto")
-        elif one.off:
+            meaning += f" One of {', '.join(f'`{choice}`' for choice in option.kind)}."
+        elif option.kind is not bool:
+            flag = f"{flag} {option.placeholder}".replace("|auto", " or auto")
+        elif option.off:
             flag += f", --no-{name}"
-        rows.append(f"| `{flag}` | {meaning} | {one.default or '–'} |")
+        rows.append(f"| `{flag}` | {meaning} | {option.default or '–'} |")
     return rows
 
 

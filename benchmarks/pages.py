@@ -147,7 +147,7 @@ def shear_stress_ratio_at(
 ) -> tuple[float, float]:
     """Contact shear stress over the binary one at a point of a map, and its standard error."""
     chosen = {"restitution": restitution, "packing_fraction": packing_fraction}
-    value, error = (float(one.sel(chosen)) for one in shear_stress_ratio(_map(file)))
+    value, error = (float(number.sel(chosen)) for number in shear_stress_ratio(_map(file)))
     return value, error
 
 
@@ -198,9 +198,9 @@ def ranked(
     return sorted(rows, key=lambda row: row["seconds"])
 
 
-def quotients(rows: Iterable[Mapping[str, float]], one: str, other: str) -> list[float]:
+def quotients(rows: Iterable[Mapping[str, float]], dividend: str, divisor: str) -> list[float]:
     """One column over another."""
-    return [row[one] / row[other] for row in rows]
+    return [row[dividend] / row[divisor] for row in rows]
 
 
 def lammps_ratio(flow: Mapping[str, Any]) -> str:
@@ -242,8 +242,8 @@ ENVIRONMENT.filters |= {
 ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table}
 ENVIRONMENT.globals |= {"SOLVER_GROUPS": GROUPS, "FACTOR_CURVES": CURVES}
 ENVIRONMENT.globals |= {
-    one.__name__: one
-    for one in (
+    function.__name__: function
+    for function in (
         *(max, at, point, quotients, ranked, validity),
         *(sig, percent, percent_pm, pm, duration),
         *(factors, grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where, product_of),

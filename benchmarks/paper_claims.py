@@ -37,11 +37,11 @@ ORDERED = ((0.9, 0.7), (0.9, 0.75), (0.9, 0.8), (0.5, 0.75), (0.5, 0.8))
 
 def run(output: Output) -> None:
     """Measure, print and write JSON."""
-    found: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for name, measure in (("order", order), ("short_averages", short_averages)):
-        found[name] = rounded(measure(output.quick), 4)
-        print(name, *found[name], sep="\n  ", flush=True)
-    output.write_json("paper_claims", found)
+        result[name] = rounded(measure(output.quick), 4)
+        print(name, *result[name], sep="\n  ", flush=True)
+    output.write_json("paper_claims", result)
 
 
 def prepared(
@@ -106,11 +106,18 @@ def order(quick: bool) -> list[dict]:
     instants = data["states"].to_dataset()
     rows = []
     for nu in data.packing_fraction.values:
-        here = instants.sel(packing_fraction=nu)
-        found = [
-            hexatic(*instant(here.isel(restitution=k))) for k in range(data.sizes["restitution"])
+        instants_here = instants.sel(packing_fraction=nu)
+        orders = [
+            hexatic(*instant(instants_here.isel(restitution=k)))
+            for k in range(data.sizes["restitution"])
         ]
-        rows.append({"packing_fraction": float(nu), "grains": here.sizes["grain"], **ranges(found)})
+        rows.append(
+            {
+                "packing_fraction": float(nu),
+                "grains": instants_here.sizes["grain"],
+                **ranges(orders),
+            }
+        )
         if quick:
             break
     rng, grains = np.random.default_rng(0), instants.sizes["grain"]
@@ -123,7 +130,7 @@ def order(quick: bool) -> list[dict]:
         flow, state = prepared(ORDERED, grains, 1e-3, width)
         _, seen = jg.snapshot_series(flow, state, strain, count)
         for k, (alpha, nu) in enumerate(ORDERED):
-            found = hexatic_order(seen.state[k])
+            orders = hexatic_order(seen.state[k])
             rows.append(
                 {
                     "restitution": alpha,
@@ -132,8 +139,8 @@ def order(quick: bool) -> list[dict]:
                     "grains": grains,
                     "timestep": 1e-3,
                     "strain": strain,
-                    "overall": [float(x) for x in found["overall"]],
-                    "local": [float(x) for x in found["local"]],
+                    "overall": [float(x) for x in orders["overall"]],
+                    "local": [float(x) for x in orders["local"]],
                 }
             )
     return rows
@@ -157,16 +164,16 @@ def hexatic(positions: np.ndarray, side: float, tilt: float) -> tuple[float, flo
 
 def hexatic_order(states: jg.State) -> dict[str, Measured]:
     """``hexatic`` of a series of states, with standard errors."""
-    found = np.array(
-        [hexatic(*one) for one in zip(states.positions, states.side, states.tilt, strict=True)]
+    orders = np.array(
+        [hexatic(*state) for state in zip(states.positions, states.side, states.tilt, strict=True)]
     )
-    sums = {"overall": found[:, 0], "local": found[:, 1], "times": np.ones(len(found))}
+    sums = {"overall": orders[:, 0], "local": orders[:, 1], "times": np.ones(len(orders))}
     return with_errors(
         lambda s: {name: s[name] / s["times"] for name in ("overall", "local")}, sums
     )
 
 
-def ranges(found: list[tuple[float, float]]) -> dict[str, list[float]]:
+def ranges(orders: list[tuple[float, float]]) -> dict[str, list[float]]:
     """Smallest, mean and largest order."""
-    values = dict(zip(("overall", "local"), np.array(found).T, strict=True))
+    values = dict(zip(("overall", "local"), np.array(orders).T, strict=True))
     return {name: [x.min(), x.mean(), x.max()] for name, x in values.items()}

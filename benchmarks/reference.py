@@ -53,7 +53,7 @@ from jaxgran.sampling.budget import SIZE_LAWS
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.navier_stokes import garzo_dufty
 
-THEORIES: dict[str, Callable] = {one.__name__: one for one in (gaussian_moments, garzo_dufty)}
+THEORIES: dict[str, Callable] = {f.__name__: f for f in (gaussian_moments, garzo_dufty)}
 TERMS = 20  # of the Chebyshev series along each coordinate
 MARGIN = 0.01  # by which the series reaches beyond the map, as a share of its range
 START = ((1.0, 1.0, 1.2, 0.1), (-0.5, -0.5, 0.5, 0.1))  # logarithms of a Shape
@@ -83,10 +83,10 @@ def run(output: Output) -> None:
         "large": {"grains": large["grains"], "rows": list(judged(table, large["rows"]))},
     }
     head |= {"whole_errors": whole_errors(table)}
-    for name, found in (
-        head["left_out"] | {f"fresh {key}": one for key, one in head["coverage"].items()}
+    for name, values in (
+        head["left_out"] | {f"fresh {key}": share for key, share in head["coverage"].items()}
     ).items():
-        print(name, found)
+        print(name, values)
     print(head["plane"])
     output.write_rows("reference", head, "rows", rows)
     output.write_picture(draw(table), "reference")
@@ -222,8 +222,8 @@ def chebyshev_series(theory: Callable, columns: dict[str, np.ndarray]) -> Series
     coefficients = {}
     mended = jax.vmap(corrected_shear)(1 - u**2, v)
     for name in THEORY:
-        for start, one in (("", predicted), (CORRECTED, mended)):
-            values = np.log(np.asarray(getattr(one, name))).reshape(TERMS, TERMS)
+        for start, averages in (("", predicted), (CORRECTED, mended)):
+            values = np.log(np.asarray(getattr(averages, name))).reshape(TERMS, TERMS)
             coefficients[f"{start}{name}"] = inverse @ values @ inverse.T
     return Series(low, high, coefficients)
 
@@ -247,8 +247,8 @@ def fitted_shape(table: Table, name: str) -> Shape:
 
     enough = {"xatol": 0.02, "fatol": 0.02}
     best = min(
-        (minimize(cost, one, method="Nelder-Mead", options=enough) for one in START),
-        key=lambda one: one.fun,
+        (minimize(cost, start, method="Nelder-Mead", options=enough) for start in START),
+        key=lambda fit: fit.fun,
     )
     shape = with_shape(best.x)
     errors, expected = type(surface)(
@@ -264,15 +264,15 @@ def fitted_shape(table: Table, name: str) -> Shape:
 
 def left_out(table: Table) -> dict[str, dict[str, float]]:
     """Leave-one-out errors of every surface, and the share within 95 % intervals."""
-    found = {}
+    result = {}
     for name, surface in table.surfaces.items():
         errors, expected = surface.left_out()
-        found[name] = {
+        result[name] = {
             "rms": round(float(np.sqrt(np.mean(errors**2))), 4),
             "noise": round(float(np.sqrt(np.mean(surface.stderrs**2))), 4),
             "covered": round(float(np.mean(np.abs(errors) < HALF_INTERVAL * expected)), 3),
         }
-    return found
+    return result
 
 
 def whole_errors(table: Table) -> dict[str, Any]:
@@ -281,16 +281,16 @@ def whole_errors(table: Table) -> dict[str, Any]:
     For each average the median, the share of points within 3 %, and the largest for every packing
     fraction.
     """
-    nus, found = table.columns["packing_fraction"], {}
+    nus, result = table.columns["packing_fraction"], {}
     for name in (*AVERAGES, "dissipation_rate"):
         _, stderr = table.surfaces[name](table.points)
         half = np.hypot(HALF_INTERVAL * stderr, np.exp(table.bounds[name](table.points)[0]))
-        found[name] = {
+        result[name] = {
             "median": round(float(np.median(half)), 4),
             "within_3_percent": round(float(np.mean(half < 0.03)), 3),
             "largest": {f"{nu:g}": round(float(half[nus == nu].max()), 4) for nu in np.unique(nus)},
         }
-    return found
+    return result
 
 
 def judged(table: Table, rows: list[dict[str, Any]]) -> Any:
@@ -304,7 +304,10 @@ def judged(table: Table, rows: list[dict[str, Any]]) -> Any:
     """
     for row in rows:
         where = coordinates(row["restitution"], row["packing_fraction"])
-        one = {"restitution": row["restitution"], "packing_fraction": row["packing_fraction"]}
+        comparison = {
+            "restitution": row["restitution"],
+            "packing_fraction": row["packing_fraction"],
+        }
         for name in MEASURED:
             log, stderr = table.surfaces[name](where)
             bounded = BOUNDED_BY.get(name, name)
@@ -317,23 +320,23 @@ def judged(table: Table, rows: list[dict[str, Any]]) -> Any:
             narrow = np.hypot(HALF_INTERVAL * stderr, own)
             whole = np.hypot(narrow, np.exp(table.bounds[name](where)[0]))
             values = np.log(row[name]) - expected, narrow, whole
-            one |= {
+            comparison |= {
                 f"{name}{end}": round(float(x), 5)
                 for end, x in zip(("", "_narrow", "_whole"), values, strict=True)
             }
-        yield one
+        yield comparison
 
 
 def coverage(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
     """Share of the fresh flows within both intervals, mean and rms difference, and its rms in units
     of the standard error.
     """
-    found = {}
+    result = {}
     for name in MEASURED:
         apart, narrow, whole = (
             np.array([row[f"{name}{end}"] for row in rows]) for end in ("", "_narrow", "_whole")
         )
-        found[name] = {
+        result[name] = {
             "covered": round(float(np.mean(np.abs(apart) < whole)), 3),
             "covered_narrow": round(float(np.mean(np.abs(apart) < narrow)), 3),
             "mean": round(float(np.mean(apart)), 4),
@@ -343,7 +346,7 @@ def coverage(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
             ),
             "median_half_width": round(float(np.median(whole)), 4),
         }
-    return found
+    return result
 
 
 # ------------------------------------------------------------------------------------------------
@@ -369,7 +372,7 @@ def plane(table: Table) -> dict[str, Any]:
     error = np.exp(table.series(points)["pressure"]) / table.columns["pressure"] - 1
     worst = int(np.argmin(np.where(table.columns[RATIO] < 1 + BINARY, error, np.inf)))
     binary = excess_from_surface(table.surfaces[RATIO](where)[0]) < BINARY
-    found: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for limit in (0.05, 0.10):
         low, high = (np.abs(np.expm1(-(over + shift))) for shift in (-half, half))
         outside = np.abs(np.expm1(-over)) > limit
@@ -381,8 +384,8 @@ def plane(table: Table) -> dict[str, Any]:
             ),
             "share_of_binary": np.mean(~outside[binary]),
         }
-        found[f"{limit:g}"] = {name: round(float(x), 3) for name, x in share.items()}
-    return found | {
+        result[f"{limit:g}"] = {name: round(float(x), 3) for name, x in share.items()}
+    return result | {
         "points": len(alphas),
         "fewest_grains": int(table.columns["grains"].min()),
         "most_grains": int(table.columns["grains"].max()),

@@ -64,16 +64,16 @@ def reference_points() -> xr.Dataset:
     """
     maps = [flattened(jg.open_map(RESULTS / name)) for name in PLANE]
     points, commits = with_points(maps[0]), [maps[0].attrs["commit"]]
-    for one in maps[1:]:
+    for data in maps[1:]:
         for name in ("timestep", "activation", "polydispersity", "tolerance"):
-            if points.attrs[name] != one.attrs[name]:
+            if points.attrs[name] != data.attrs[name]:
                 raise ValueError(f"{', '.join(PLANE)} must have the same {name}.")
-        finer = with_points(one).reindex_like(points[["packing_fraction", "restitution"]])
+        finer = with_points(data).reindex_like(points[["packing_fraction", "restitution"]])
         measured = finer.pressure.notnull()
-        if int(measured.sum()) != one.pressure.size:
+        if int(measured.sum()) != data.pressure.size:
             raise ValueError(f"{PLANE[0]} lacks points of another map of {', '.join(PLANE)}.")
         points = finer.where(measured, points).assign_attrs(points.attrs)
-        commits.append(one.attrs["commit"])
+        commits.append(data.attrs["commit"])
     numbers = {name: points[f"point_{name}"].astype(int) for name in ("grains", "seeds")}
     points = points.assign(status=points.status.astype(int)).assign_coords(
         {f"point_{name}": x for name, x in numbers.items()}

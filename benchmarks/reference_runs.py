@@ -61,10 +61,10 @@ def large_rows(**plan: float) -> Iterator[dict]:
 
 def large_row(plan: dict[str, float], flow: tuple[float, float]) -> dict:
     """Averages of a large flow."""
-    one = {"restitution": flow[0], "packing_fraction": flow[1], "grains": plan["grains"]}
+    chosen = {"restitution": flow[0], "packing_fraction": flow[1], "grains": plan["grains"]}
     begin = time.process_time()
-    data = jg.ratio_map(**(plan | one), seeds=1, first_seed=FIRST_SEED, workers=1)
-    return one | _row(data) | {"cpu_seconds": round(time.process_time() - begin)}
+    data = jg.ratio_map(**(plan | chosen), seeds=1, first_seed=FIRST_SEED, workers=1)
+    return chosen | _row(data) | {"cpu_seconds": round(time.process_time() - begin)}
 
 
 def random_points(count: int) -> Iterator[tuple[float, float]]:
@@ -78,13 +78,15 @@ def random_points(count: int) -> Iterator[tuple[float, float]]:
 def fresh_rows(points: int, grains: list[int], timestep: float) -> Iterator[dict]:
     """Averages, standard errors and the bounds of timestep and tolerance of every point."""
     for k, (alpha, nu) in enumerate(random_points(points)):
-        one = {
+        flow = {
             "restitution": alpha,
             "packing_fraction": nu,
             "grains": grains[nu > (LOOSE[-1] + DENSE[0]) / 2],
         }
-        data = jg.ratio_map(**one, timestep=timestep, seeds=1, first_seed=FIRST_SEED + k, workers=1)
-        yield one | _row(data)
+        data = jg.ratio_map(
+            **flow, timestep=timestep, seeds=1, first_seed=FIRST_SEED + k, workers=1
+        )
+        yield flow | _row(data)
 
 
 def _row(data: xr.DataTree) -> dict[str, float]:

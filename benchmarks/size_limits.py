@@ -77,8 +77,8 @@ def run(output: Output) -> None:
             {"average": average, **compared_with_larger(large, flows, average, laws[average])}
         )
         limits += [
-            {"average": average, **one}
-            for one in limits_of(loose, laws[average]["exponents"]["interval"])
+            {"average": average, **limit}
+            for limit in limits_of(loose, laws[average]["exponents"]["interval"])
         ]
         print(average, rounded(laws[average], 4))
         print(rounded(tests[-1], 4))
@@ -99,11 +99,11 @@ def rows_of_maps(*names: str) -> list[dict[str, Any]]:
         data = jg.open_map(RESULTS / f"reference_{name}.nc")
         chosen = [*AVERAGES, *(f"{average}_stderr" for average in AVERAGES)]
         frame = data.to_dataset()[chosen].to_dataframe().reset_index()
-        for one in frame.to_dict("records"):
-            row = {axis: one[axis] for axis in ("restitution", "packing_fraction", "grains")}
+        for record in frame.to_dict("records"):
+            row = {axis: record[axis] for axis in ("restitution", "packing_fraction", "grains")}
             rows.append(
                 row
-                | {x: [one[x], one[f"{x}_stderr"]] for x in AVERAGES}
+                | {x: [record[x], record[f"{x}_stderr"]] for x in AVERAGES}
                 | {"source": name.removeprefix("sizes_")}
             )
     return rows
@@ -157,21 +157,21 @@ def limits_of(flows: list[Flow], interval: list[float]) -> list[dict[str, Any]]:
     """For each flow the limit by the exponents at both ends of their interval, and the 95 %
     interval of both.
     """
-    found = []
+    limits = []
     for flow in flows:
         ends = [fitted(flow, flow.grains**-s) for s in interval]
-        bounds = [one[0] + sign * 1.96 * one[2] for one in ends for sign in (-1, 1)]
-        found.append(
+        bounds = [end[0] + sign * 1.96 * end[2] for end in ends for sign in (-1, 1)]
+        limits.append(
             {
                 "source": flow.source,
                 "restitution": flow.restitution,
                 "packing_fraction": flow.packing_fraction,
                 "largest": [flow.grains[-1], flow.values[-1], flow.stderrs[-1]],
-                "limit": [list(one[::2]) for one in ends],
+                "limit": [list(end[::2]) for end in ends],
                 "interval": [min(bounds), max(bounds)],
             }
         )
-    return found
+    return limits
 
 
 def compared_with_larger(
@@ -292,19 +292,19 @@ def law_of(flows: list[Flow], spread: float) -> dict[str, Any]:
     """
 
     def residuals(constants: np.ndarray) -> np.ndarray:
-        found = []
+        misfits = []
         for flow in flows:
             shape = (1 - missing_part(constants, flow)) / flow.stderrs
             scaled = flow.values / flow.stderrs
-            found.append(shape * (shape @ scaled) / (shape @ shape) - scaled)
-        return np.concatenate(found)
+            misfits.append(shape * (shape @ scaled) / (shape @ shape) - scaled)
+        return np.concatenate(misfits)
 
     lowest, highest = (0.05, 0, 0, -3, 0.76), (1.5, 1, 2, 10, 0.9)
     starts = [(s, *START[1:]) for s in (0.15, 0.4, 0.7)]
     fits = [
         least_squares(residuals, start, bounds=(lowest, highest), x_scale="jac") for start in starts
     ]
-    best = min(fits, key=lambda one: one.cost)
+    best = min(fits, key=lambda fit: fit.cost)
     freedom = best.fun.size - len(flows) - best.x.size
     covariance = np.linalg.pinv(best.jac.T @ best.jac) * max(1.0, 2 * best.cost / freedom)
     return {

@@ -110,9 +110,11 @@ def one_seed(flow: jg.ShearFlow, before: float, strain: float, seed: int) -> dic
         state, sample = jg.sample(flow, state, strain / BLOCKS, blocks=1)
         tallies.append(jax.tree.map(lambda x: np.asarray(x[0]), sample.tally))
         structures.append(structure(state))
-    tally = {f"tally_{name}": np.stack([getattr(one, name) for one in tallies]) for name in TABLE}
-    found = {name: np.stack([one[name] for one in structures]) for name in structures[0]}
-    return {"area": np.asarray(state.side) ** 2, **tally, **found}
+    sums = {
+        f"tally_{name}": np.stack([getattr(block, name) for block in tallies]) for name in TABLE
+    }
+    shapes = {name: np.stack([block[name] for block in structures]) for name in structures[0]}
+    return {"area": np.asarray(state.side) ** 2, **sums, **shapes}
 
 
 def structure(state: jg.State) -> dict[str, np.ndarray]:
@@ -304,13 +306,13 @@ def result(plan: Plan, flow: int, grains: int, folder: Path) -> dict:
     }
     number = {"restitution": alpha, "packing_fraction": nu, "grains": grains, "seeds": len(seeds)}
     numbers = {name: float(row[name]) for name in ("before", "strain", "seconds")}
-    found = {name: [float(values[name]), float(errors[name])] for name in RESULTS}
+    averages = {name: [float(values[name]), float(errors[name])] for name in RESULTS}
     return {
         **number,
         **numbers,
         "memory": memory_of(values, nu, grains, row["area"][0]),
         **measured,
-        **found,
+        **averages,
         **structure_result(row, grains),
     }
 

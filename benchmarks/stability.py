@@ -124,7 +124,7 @@ def run(output: Output) -> None:
     plan, rows = QUICK if output.quick else FULL, []
     with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
         dense_first = sorted(plan.flows, key=lambda flow: -flow[1])
-        for future in as_completed(pool.submit(rows_of_flow, plan, one) for one in dense_first):
+        for future in as_completed(pool.submit(rows_of_flow, plan, flow) for flow in dense_first):
             rows += future.result()
     rows.sort(key=lambda row: plan.flows.index((row["alpha"], row["nu"])))
     head = {**plan._asdict(), "right": RIGHT, "missing": lammps.missing()}
@@ -153,8 +153,8 @@ def rows_of_flow(plan: Plan, flow: tuple[float, float]) -> list[dict]:
     longer = plan._replace(blocks=REFERENCE_BLOCKS * plan.blocks)
     reference = None
     if nu != JAMMED:
-        found, _ = sheared(longer, flow, states, REFERENCE_TIMESTEP, solver, limit=np.inf)
-        reference = stress_means([found])
+        stresses, _ = sheared(longer, flow, states, REFERENCE_TIMESTEP, solver, limit=np.inf)
+        reference = stress_means([stresses])
     ways = {
         method: (settings, partial(by_peer, peer, plan, flow, states))
         for method, (peer, settings) in PEERS.items()
@@ -167,9 +167,12 @@ def rows_of_flow(plan: Plan, flow: tuple[float, float]) -> list[dict]:
     for method, (settings, way) in ways.items():
         verdicts = []
         for setting in settings:
-            found, how = way(setting)
+            stresses, how = way(setting)
             row = {"alpha": alpha, "nu": nu, "method": method, "setting": setting, **how}
-            row |= {"strain": len(found) * plan.strain, "errors": relative_errors(found, reference)}
+            row |= {
+                "strain": len(stresses) * plan.strain,
+                "errors": relative_errors(stresses, reference),
+            }
             rows.append(row)
             verdicts.append(verdict(row))
             print(
@@ -183,14 +186,14 @@ def rows_of_flow(plan: Plan, flow: tuple[float, float]) -> list[dict]:
 
 
 def relative_errors(
-    found: list[Stress], reference: dict[str, tuple[float, float]] | None
+    stresses: list[Stress], reference: dict[str, tuple[float, float]] | None
 ) -> list[tuple[float, float]] | None:
     """Errors of the stresses of some blocks with standard errors, relative to a reference; None
     without either.
     """
-    if len(found) < 2 or reference is None:
+    if len(stresses) < 2 or reference is None:
         return None
-    measured = stress_means([found])
+    measured = stress_means([stresses])
     return [relative(measured[name], reference[name]) for name in STRESSES]
 
 
@@ -230,8 +233,8 @@ def start(grains: int, alpha: float, nu: float, seed: int) -> jg.State:
     if nu != JAMMED:
         return jg.prepare(jg.ShearFlow(grains, alpha, nu, 3e-4), jax.random.key(seed))
     for attempt in range(10):
-        state, found = pack(flow_of(grains, alpha, nu, 1e-3), jax.random.key(10 * seed + attempt))
-        if found:
+        state, packed = pack(flow_of(grains, alpha, nu, 1e-3), jax.random.key(10 * seed + attempt))
+        if packed:
             break
     masses = np.asarray(state.grains.masses)[:, None]
     velocities = np.random.default_rng(seed).normal(size=state.velocities.shape) / np.sqrt(masses)
@@ -251,17 +254,17 @@ def sheared(
     """Pressure and shear stress of the blocks of all seeds, what went wrong, and the
     largest overlap; the first block of a seed is left out, and its first part of the time.
     """
-    one = flow_of(plan.grains, *flow, dt, dtype)
+    sheared_flow = flow_of(plan.grains, *flow, dt, dtype)
     solver = solver or jg.BarzilaiBorwein()
     solver = jax.tree.map(
         lambda x: jnp.asarray(x, "int32" if isinstance(x, int) else dtype), solver
     )
     total = round(plan.strain / dt)
-    found: list[Stress] = []
+    stresses: list[Stress] = []
     worst, deepest = "ok", 0.0
 
     def ended(outcome: str) -> tuple[list[Stress], dict]:
-        return found, {"outcome": outcome, "largest_overlap": deepest}
+        return stresses, {"outcome": outcome, "largest_overlap": deepest}
 
     for first in states:
         state = jax.tree.map(lambda x: x.astype(dtype), first)
@@ -269,7 +272,7 @@ def sheared(
         for block in range(plan.blocks + 1):
             before = energy(state)
             for piece in pieces(total) if block == 0 else [total]:
-                state, tally = advance(one, state, jnp.int32(piece), solver=solver)
+                state, tally = advance(sheared_flow, state, jnp.int32(piece), solver=solver)
                 status = jg.Status(int(tally.status))
                 deepest = max(deepest, float(tally.largest_overlap))
                 if status not in (jg.Status.ok, jg.Status.deep_overlap):
@@ -287,8 +290,8 @@ def sheared(
             if status == jg.Status.deep_overlap or tally.largest_overlap > DEEP_OVERLAP:
                 worst = "deep_overlap"
             if block:
-                mean = averages(tally, state.side**2, plan.grains, one.shear_rate)
-                found.append(Stress(*(float(mean[name]) for name in STRESSES)))
+                mean = averages(tally, state.side**2, plan.grains, sheared_flow.shear_rate)
+                stresses.append(Stress(*(float(mean[name]) for name in STRESSES)))
     return ended(worst)
 
 
@@ -322,16 +325,16 @@ def by_peer(
     peer: Any, plan: Plan, flow: tuple[float, float], states: list[jg.State], setting: float
 ) -> tuple[list[Stress], dict]:
     """Stresses of the blocks of all seeds by another program, and how it failed."""
-    (curve,), found = peer.CURVES, []
+    (curve,), stresses = peer.CURVES, []
     for state in states:
         try:
-            found += blocks_of(
+            stresses += blocks_of(
                 peer, discs_of(state), Flow(*flow), curve, setting, plan.strain, plan.blocks
             )
         except Exception as failure:  # of a program that is not ours to mend
             outcome = "collapse" if peer is event_driven else "gives_up"
-            return found, {"outcome": outcome, "detail": str(failure)}
-    return found, {"outcome": "ok"}
+            return stresses, {"outcome": outcome, "detail": str(failure)}
+    return stresses, {"outcome": "ok"}
 
 
 # ----------------------------------------------------------------------------------------------

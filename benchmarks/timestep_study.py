@@ -110,13 +110,13 @@ def samples(plan: Plan, task: tuple[float, float, str, int]) -> dict[float, jg.S
 
     strain = plan.strain[plan.packing_fraction.index(nu)]
     steady = jg.prepare(flow(START), jax.random.key(seed))
-    found, state = {}, steady
+    sampled, state = {}, steady
     for timestep in sorted(plan.timesteps, reverse=True):
         before = steady if timestep >= START else state
         relaxed, _ = advance(flow(timestep), before, jnp.int32(round(RELAXATION / timestep)))
         state, sample = jg.sample(flow(timestep), relaxed, strain)
-        found[timestep] = jax.tree.map(np.asarray, sample)
-    return found
+        sampled[timestep] = jax.tree.map(np.asarray, sample)
+    return sampled
 
 
 def curve(plan: Plan, seeds: list[dict[float, jg.Sample]]) -> list[dict]:
@@ -145,7 +145,7 @@ def extrapolated(points: dict[str, list[dict]]) -> dict:
     length = len(data[0][0])
     usual = min(length, max(FEWEST_FITTED, 2 * length // 3))
     tried = [n for n in (usual - 1, usual, usual + 1) if FEWEST_FITTED <= n <= length]
-    fits = {n: joint_fit([tuple(values[:n] for values in one) for one in data]) for n in tried}
+    fits = {n: joint_fit([tuple(values[:n] for values in part) for part in data]) for n in tried}
     (best, _, _), exponents = fits[usual]
     low, high = (
         min(limit[1] for limit, _ in fits.values()),
@@ -172,7 +172,7 @@ def joint_fit(data: list[tuple]) -> tuple[tuple[float, float, float], list[float
     curve.
     """
     low, high = 0.0, max(min(excess[0] + 2 * error[0] for _, excess, error in data), 1e-9)
-    freedom = max(1, sum(len(one[0]) for one in data) - 5)
+    freedom = max(1, sum(len(part[0]) for part in data) - 5)
     for _ in range(REFINEMENTS):
         limits = np.linspace(low, high, TRIED_LIMITS)
         fits = [
@@ -197,8 +197,8 @@ def power_law(dt: np.ndarray, excess: np.ndarray, error: np.ndarray) -> tuple[fl
         amplitude = np.sum(shape * excess / error) / np.sum(shape**2)
         return float(np.sum((excess / error - amplitude * shape) ** 2))
 
-    found = minimize_scalar(chi2, bounds=(0.02, 2.0), method="bounded")
-    return found.fun, found.x
+    minimum = minimize_scalar(chi2, bounds=(0.02, 2.0), method="bounded")
+    return minimum.fun, minimum.x
 
 
 LEAST = 1e-5  # smallest excess that is drawn
@@ -215,10 +215,10 @@ def draw(flows: list[dict]) -> Figure:
     figure = Figure(figsize=(TWO_COLUMNS, 3.4), layout="constrained")
     panels = figure.subplots(1, len(fractions), sharey=True, squeeze=False)[0]
     for axes, nu in zip(panels, fractions, strict=True):
-        here = sorted(
+        curves = sorted(
             (f for f in flows if f["packing_fraction"] == nu), key=lambda f: -f["restitution"]
         )
-        for flow in here:
+        for flow in curves:
             k = restitutions.index(flow["restitution"])
             style = {
                 "color": ("black", "tab:blue", "tab:red")[k % 3],
@@ -241,7 +241,7 @@ def draw(flows: list[dict]) -> Figure:
                 )
                 bad = np.array([p["status"] != "ok" for p in points]) & shown
                 axes.plot(dt[bad], excess[bad], "x", color="0.4", markersize=7, zorder=4)
-            draw_limit(axes, flow["limit"], dt.min() / (2.2 + 1.3 * here.index(flow)), style)
+            draw_limit(axes, flow["limit"], dt.min() / (2.2 + 1.3 * curves.index(flow)), style)
         axes.axvline(dt.min() / 1.6, color="0.7", linewidth=0.8)
         axes.set_xscale("log")
         axes.set_yscale("log")

@@ -71,7 +71,7 @@ def proved(problem: Problem) -> Solved:
             and (middle := centre(problem).impulses) is not None
         ):
             result = min(
-                result, solved(problem, middle), key=lambda one: one.certificate["natural_map"]
+                result, solved(problem, middle), key=lambda x: x.certificate["natural_map"]
             )
         if not result.certificate["natural_map"] <= WORST:
             raise ArithmeticError(f"no certificate for {count} contacts: {result.certificate}")
@@ -107,11 +107,11 @@ def summary(entries: list[Entry]) -> list[dict]:
         families.setdefault((entry.family, entry.solution.feasible), []).append(entry)
     rows = []
     for (family, feasible), members in families.items():
-        sizes = [len(one.problem.approach) for one in members]
+        sizes = [len(member.problem.approach) for member in members]
         row = {"family": family, "problems": len(members), "feasible": feasible}
         row |= {"fewest_contacts": min(sizes), "most_contacts": max(sizes)}
         for key in members[0].solution.certificate:
-            values = [one.solution.certificate[key] for one in members]
+            values = [member.solution.certificate[key] for member in members]
             row[f"{key}_median"], row[f"{key}_worst"] = (
                 float(f"{f(values):.2g}") for f in (np.median, max)
             )

@@ -124,7 +124,7 @@ def _outer_pairs(x, y, radii, side, tilt, skin, heads, links, first, second, shi
     """
     grains = x.size
     room = first.size
-    found = 0
+    count = 0
     reach = 2.0 * radii.max() + skin
     rows = int(side / reach)
     columns = int(side / (reach * math.sqrt(1.0 + tilt * tilt)))
@@ -140,13 +140,13 @@ def _outer_pairs(x, y, radii, side, tilt, skin, heads, links, first, second, shi
                 dx -= nx * side
                 limit = radii[i] + radii[j] + skin
                 if dx * dx + dy * dy < limit * limit:
-                    if found < room:
-                        first[found] = i
-                        second[found] = j
-                        shift_x[found] = (nx + ny * tilt) * side
-                        image[found] = ny
-                    found += 1
-        return found
+                    if count < room:
+                        first[count] = i
+                        second[count] = j
+                        shift_x[count] = (nx + ny * tilt) * side
+                        image[count] = ny
+                    count += 1
+        return count
 
     heads[: rows * columns] = -1
     for i in range(grains):
@@ -188,16 +188,16 @@ def _outer_pairs(x, y, radii, side, tilt, skin, heads, links, first, second, shi
                         dy = yi - y[j]
                         limit = touching + radii[j]
                         if dx * dx + dy * dy < limit * limit:
-                            if found < room:
-                                first[found] = i
-                                second[found] = j
-                                shift_x[found] = across
-                                image[found] = ny
-                            found += 1
+                            if count < room:
+                                first[count] = i
+                                second[count] = j
+                                shift_x[count] = across
+                                image[count] = ny
+                            count += 1
                         j = links[j]
                     i = links[i]
     # The image that was moved is j's: s = r_i - r_j - shift.
-    return found
+    return count
 
 
 @compiled

@@ -30,8 +30,8 @@ def begin(discs: Discs, flow: Flow, curve: str, contact_duration: float, duratio
     def advance() -> Stress:
         nonlocal now
         now, sums = sheared(now, law, duration, most_collisions=most)
-        found = averages(sums, now)
-        return Stress(*(found[name].item() for name in Stress._fields if name in found))
+        values = averages(sums, now)
+        return Stress(*(values[name].item() for name in Stress._fields if name in values))
 
     def current() -> Discs:
         return Discs(**{name: getattr(now, name) for name in Discs._fields})

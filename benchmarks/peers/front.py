@@ -41,16 +41,16 @@ def equal_work(flow: dict, curve: str) -> tuple[Choice, Choice] | None:
         return None
     depth = theirs.row["largest_overlap"]
     ours = rows_of(flow, "jaxgran")
-    found = cheapest([row for row in ours if row["largest_overlap"] <= depth] or ours[-1:])
-    return None if found is None else (found, theirs)
+    our_row = cheapest([row for row in ours if row["largest_overlap"] <= depth] or ours[-1:])
+    return None if our_row is None else (our_row, theirs)
 
 
 def ratio(flow: dict, curve: str) -> str:
     """Time of another program over that of jaxgran; "> " where it does not reach the target."""
-    found = equal_work(flow, curve)
-    if found is None:
+    pair = equal_work(flow, curve)
+    if pair is None:
         return "–"
-    ours, theirs = found
+    ours, theirs = pair
     if not ours.reached:
         return "–"
     sign = "" if theirs.reached else "> "
@@ -66,15 +66,15 @@ def table(flows: list[dict]) -> str:
     for flow in flows:
         where = f"{flow['restitution']:g}, {flow['packing_fraction']:g}"
         for curve in ("jaxgran", "numba loop", "LAMMPS", "event-driven"):
-            found = cheapest(rows_of(flow, curve))
-            if found is None:
+            best = cheapest(rows_of(flow, curve))
+            if best is None:
                 lines.append(f"| {where} | {curve} | – | it collapses | – | – | – | – |")
                 continue
-            errors = [f"{100 * e:+.1f} ± {100 * s:.1f} %" for e, s in _errors(found.row)]
-            cost = _two_digits(1e6 * found.row[COST] / flow["discs"])
+            errors = [f"{100 * e:+.1f} ± {100 * s:.1f} %" for e, s in _errors(best.row)]
+            cost = _two_digits(1e6 * best.row[COST] / flow["discs"])
             over = "1" if curve == "jaxgran" else ratio(flow, curve)
-            overlap = _two_digits(found.row["largest_overlap"])
-            cells = where, curve, _setting(curve, found.row), cost, over, *errors, overlap
+            overlap = _two_digits(best.row["largest_overlap"])
+            cells = where, curve, _setting(curve, best.row), cost, over, *errors, overlap
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -66,11 +66,11 @@ def blocks_of(
     """Stresses of some successive advances of a run, past a first one that is left out; the run is
     closed, also where the program fails.
     """
-    one: Run = peer.begin(discs, flow, curve, setting, duration)
+    run: Run = peer.begin(discs, flow, curve, setting, duration)
     try:
-        return [one.advance() for _ in range(count + 1)][1:]
+        return [run.advance() for _ in range(count + 1)][1:]
     finally:
-        one.close()
+        run.close()
 
 
 def averages(runs: Sequence[Sequence[Stress]]) -> dict[str, tuple[float, float]]:

@@ -87,15 +87,15 @@ def table(rows: Sequence[Row], targets: Sequence[float] = (1e-4, 1e-8), shown: i
     members, lines = grouped(rows), []
     for group in GROUPS:
         for target in (0.0,) if group == INFEASIBLE else targets:
-            found = {
+            rows_of = {
                 key[1]: each
                 for key, each in members.items()
                 if key[0] == group and key[2] == target
             }
-            if not found:
+            if not rows_of:
                 continue
-            ranked = sorted(found, key=lambda name: median([cost(row) for row in found[name]]))
-            cells = [table_cell(name, found[name]) for name in ranked[:shown]]
+            ranked = sorted(rows_of, key=lambda name: median([cost(row) for row in rows_of[name]]))
+            cells = [table_cell(name, rows_of[name]) for name in ranked[:shown]]
             lines.append(f"| {group} | {target:.0e} | " + " | ".join(cells) + " |")
     head = "| problems | residual | " + " | ".join(f"{n + 1}." for n in range(shown)) + " |"
     return "\n".join([head, "| --- " * (shown + 2) + "|", *lines])

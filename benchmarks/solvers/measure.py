@@ -124,7 +124,7 @@ def best_run(name: str, entry: Entry, matrix, runs: list[Attempt], target: float
     good = [run for run in runs if run.residual <= target and run.seconds <= LIMIT]
     if not good:
         return _row(name, entry, target, "slow" if runs[-1].seconds > LIMIT else "missed")
-    run = min(good, key=lambda one: one.seconds)
+    run = min(good, key=lambda candidate: candidate.seconds)
     errors = velocity_error(entry, matrix, run.impulses), stress_error(entry, run.impulses)
     return _row(
         name, entry, target, "ok", run.tolerance, run.seconds, run.iterations, run.residual, *errors

@@ -97,10 +97,10 @@ def package_solvers() -> dict[str, Solver]:
 
 def versions() -> dict[str, str]:
     """Versions of the packages that are installed."""
-    found = {}
+    numbers = {}
     for name in PACKAGES:
         try:
-            found[name] = version(name)
+            numbers[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return numbers

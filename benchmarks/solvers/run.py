@@ -69,8 +69,8 @@ def run(output: Output) -> None:
         "wall_seconds": round(time.perf_counter() - start),
         "agreement": agreed,
         "worst_stress_error_of_flows_over_tolerance": {
-            name: {f"{tolerance:.0e}": float(f"{ratio:.3g}") for tolerance, ratio in found.items()}
-            for name, found in stress.items()
+            name: {f"{tolerance:.0e}": float(f"{ratio:.3g}") for tolerance, ratio in ratios.items()}
+            for name, ratios in stress.items()
         },
     }
     output.write_rows("solvers", head, "summary", summary(rows))
@@ -103,15 +103,19 @@ def agreement(finest: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict]:
 
     Velocities are in units of the fastest approach of the problem.
     """
-    names = sorted({name for found in finest.values() for name in found})
+    names = sorted({name for impulses in finest.values() for name in impulses})
     pairs = []
-    for one, other in itertools.combinations(names, 2):
-        both = [found for found in finest.values() if one in found and other in found]
+    for first, second in itertools.combinations(names, 2):
+        both = [
+            impulses for impulses in finest.values() if first in impulses and second in impulses
+        ]
         if both:
-            largest = max(float(np.max(np.abs(found[one] - found[other]))) for found in both)
+            largest = max(
+                float(np.max(np.abs(impulses[first] - impulses[second]))) for impulses in both
+            )
             pairs.append(
                 {
-                    "solvers": [one, other],
+                    "solvers": [first, second],
                     "problems": len(both),
                     "largest_difference": float(f"{largest:.2g}"),
                 }

@@ -145,12 +145,12 @@ def fit_trajectory(
             "more iterations, or the true noise."
         )
     restitution, offsets = unknowns
-    found = _moved(start, noises, offsets)
+    moved = _moved(start, noises, offsets)
     return TrajectoryFit(
         float(restitution),
         float(1 / np.sqrt(information)),
         misfit,
-        **{name: np.asarray(getattr(found, name)) for name in offsets},
+        **{name: np.asarray(getattr(moved, name)) for name in offsets},
     )
 
 

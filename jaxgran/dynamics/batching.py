@@ -27,17 +27,17 @@ def with_own_batching(function: Callable[..., T]) -> Callable[..., T]:
     Where the first argument is the same for all replicas, so are all conditions, and the usual rule
     is taken: as where ``jax.jacfwd`` follows many tangents of one flow.
     """
-    one = custom_vmap(function)
+    batched_function = custom_vmap(function)
     together = custom_vmap(lambda *batch: jax.vmap(function, axis_name=AXIS)(*batch))
 
-    @one.def_vmap
+    @batched_function.def_vmap
     def of_replicas(size: int, batched: Any, *arguments: Any) -> tuple[T, Any]:
         if not any(jax.tree.leaves(batched[0])):
             axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
             return _all_batched(jax.vmap(function, axes)(*arguments))
         if in_lockstep():
             return _all_batched(together(*_with_axis(size, batched, arguments)))
-        return _all_batched(_in_turn(one, batched, arguments))
+        return _all_batched(_in_turn(batched_function, batched, arguments))
 
     @together.def_vmap
     def of_batches(size: int, batched: Any, *arguments: Any) -> tuple[T, Any]:
@@ -45,7 +45,7 @@ def with_own_batching(function: Callable[..., T]) -> Callable[..., T]:
         result = together(*jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batches))
         return _all_batched(jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), result))
 
-    return one
+    return batched_function
 
 
 def with_forward_derivative(

@@ -58,14 +58,14 @@ def _depends_on_traced(observe: Observe, flow: ShearFlow, state: State) -> bool:
     ``_recorded`` would not see.
     """
 
-    def found(flow: ShearFlow, state: State) -> Any:
+    def observation(flow: ShearFlow, state: State) -> Any:
         return without_contacts(partial(observe, flow, state), state.positions.dtype)
 
     # First what it returns is judged: other things than numbers cannot be traced.
     nothing_observed(
         partial(observe, flow, state), MOST_CONTACTS * flow.grains, state.positions.dtype
     )
-    return any(isinstance(x, Tracer) for x in jax.make_jaxpr(found)(flow, state).consts)
+    return any(isinstance(x, Tracer) for x in jax.make_jaxpr(observation)(flow, state).consts)
 
 
 def records_of_call(grains: int) -> int:

@@ -49,7 +49,7 @@ def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> O
         for contacts.
     """
 
-    def found(slots: int) -> Any:
+    def returned(slots: int) -> Any:
         def numbers() -> Any:
             values = observe_now(_no_contacts(slots, dtype), jnp.zeros(slots, dtype))
             if not jax.tree.leaves(values):
@@ -63,7 +63,7 @@ def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> O
 
         return jax.eval_shape(numbers)
 
-    few, many = found(1), found(slots)
+    few, many = returned(1), returned(slots)
     if few != many:
         raise InputError(
             "observe must return sums over the contacts: a step has slots for more or fewer of "
@@ -78,21 +78,25 @@ def with_flight(user_sums: Observed, observe_now: ObserveNow, steps: Array) -> O
     """
     dtype = user_sums.step_observed.dtype
     weight = steps.astype(dtype) - user_sums.step_observed
-    found = without_contacts(observe_now, dtype)
-    return Observed(added(user_sums.sums, found, weight), jnp.zeros_like(user_sums.step_observed))
+    observables = without_contacts(observe_now, dtype)
+    return Observed(
+        added(user_sums.sums, observables, weight), jnp.zeros_like(user_sums.step_observed)
+    )
 
 
 def with_contacts(
     user_sums: Observed, observe_now: ObserveNow, network: Contacts, impulses: Array
 ) -> Observed:
     """The sums with the present step, whose contacts act."""
-    one = jnp.ones_like(user_sums.step_observed)
-    return Observed(added(user_sums.sums, observe_now(network, impulses), one), one)
+    weight = jnp.ones_like(user_sums.step_observed)
+    return Observed(added(user_sums.sums, observe_now(network, impulses), weight), weight)
 
 
-def added(sums: Any, found: Any, weight: Array) -> Any:
-    """The sums with what was found, by its number of steps."""
-    return jax.tree.map(lambda old, x: old + weight * jnp.asarray(x).astype(old.dtype), sums, found)
+def added(sums: Any, observables: Any, weight: Array) -> Any:
+    """The sums with observables that hold for so many steps."""
+    return jax.tree.map(
+        lambda old, x: old + weight * jnp.asarray(x).astype(old.dtype), sums, observables
+    )
 
 
 def without_contacts(observe_now: ObserveNow, dtype: jnp.dtype) -> Any:

@@ -204,7 +204,7 @@ def snapshots_from(
 
 def _series_of_loaded(snapshots: Sequence[Snapshot]) -> Snapshot:
     """One series of single snapshots, with as many slots as the most loaded contacts of a time."""
-    slots = [np.flatnonzero(one.impulses > 0) for one in snapshots]
+    slots = [np.flatnonzero(snapshot.impulses > 0) for snapshot in snapshots]
     most = max(map(len, slots))
 
     def loaded(values: Array, slots: np.ndarray) -> np.ndarray:
@@ -212,11 +212,11 @@ def _series_of_loaded(snapshots: Sequence[Snapshot]) -> Snapshot:
             np.asarray(values)[slots], [(0, most - len(slots)), *[(0, 0)] * (np.ndim(values) - 1)]
         )
 
-    def with_loaded(one: Snapshot, slots: np.ndarray) -> Snapshot:
+    def with_loaded(snapshot: Snapshot, slots: np.ndarray) -> Snapshot:
         contacts, impulses = jax.tree.map(
-            partial(loaded, slots=slots), (one.contacts, one.impulses)
+            partial(loaded, slots=slots), (snapshot.contacts, snapshot.impulses)
         )
-        return replace(one, contacts=contacts, impulses=impulses)
+        return replace(snapshot, contacts=contacts, impulses=impulses)
 
     return jax.tree.map(lambda *x: np.stack(x), *map(with_loaded, snapshots, slots))
 

@@ -52,7 +52,7 @@ class Indexable:
         return True  # a single value has no length
 
 
-def equal_values(one: Any, other: object) -> bool:
+def equal_values(value: Any, other: object) -> bool:
     """The method ``__eq__``: whether two values are of one class and hold equal numbers of equal
     shapes.
 
@@ -62,20 +62,20 @@ def equal_values(one: Any, other: object) -> bool:
     Raises:
       InputError: JAX traces one of the values.
     """
-    if type(one) is not type(other):
+    if type(value) is not type(other):
         return NotImplemented
-    if is_traced(one, other):
+    if is_traced(value, other):
         raise InputError(
-            f"two values of {type(one).__name__} cannot be compared while JAX traces them: compare "
-            "them before or after, or their arrays by jnp.array_equal."
+            f"two values of {type(value).__name__} cannot be compared while JAX traces them: "
+            "compare them before or after, or their arrays by jnp.array_equal."
         )
-    (leaves, structure), (others, of_other) = jax.tree.flatten(one), jax.tree.flatten(other)
+    (leaves, structure), (others, of_other) = jax.tree.flatten(value), jax.tree.flatten(other)
     return structure == of_other and all(map(_equal, leaves, others))
 
 
-def _equal(one: Any, other: Any) -> bool:
-    numbers = all(np.asarray(x).dtype.kind == "f" for x in (one, other))
-    return one is other or np.array_equal(one, other, equal_nan=numbers)
+def _equal(leaf: Any, other_leaf: Any) -> bool:
+    numbers = all(np.asarray(x).dtype.kind == "f" for x in (leaf, other_leaf))
+    return leaf is other_leaf or np.array_equal(leaf, other_leaf, equal_nan=numbers)
 
 
 def in_numpy(tree: T) -> T:

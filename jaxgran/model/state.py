@@ -119,10 +119,10 @@ def require_match(flow: ShearFlow, state: State) -> None:
         2 * radii, 1 + spread * quantiles, rtol=0, atol=_ROUNDING
     ):
         of_state["polydispersity"] = float(spread)
-    for name, found in of_state.items():
-        if abs(found - float(getattr(flow, name))) > _ROUNDING:
+    for name, value in of_state.items():
+        if abs(value - float(getattr(flow, name))) > _ROUNDING:
             raise InputError(
-                f"{name} must be {found:.6g}, which the state has, not "
+                f"{name} must be {value:.6g}, which the state has, not "
                 f"{float(getattr(flow, name)):g}: a flow with "
                 "another one begins with a state of its own, from prepare."
             )

@@ -32,7 +32,7 @@ MOST_POINTS = 2500
 """Points of a page; of a larger map a part is shown."""
 
 _NAMED = {
-    name: one.kind for name, one in options("run").items() if isinstance(one.kind, tuple)
+    name: option.kind for name, option in options("run").items() if isinstance(option.kind, tuple)
 }  # choices of a run
 
 
@@ -189,8 +189,8 @@ def _instants(data: xr.Dataset) -> list[dict[str, Any] | None] | None:
     fields = {name: data[f"states/{name}"] for name in FIELDS}
 
     def instant(place: dict[str, int], point: dict[str, float]) -> dict[str, Any] | None:
-        here = {n: x.isel(place, missing_dims="ignore").values for n, x in fields.items()}
-        state = state_of(here)
+        fields_here = {n: x.isel(place, missing_dims="ignore").values for n, x in fields.items()}
+        state = state_of(fields_here)
         if state is None or len(state.grains.radii) > MOST_GRAINS or np.isnan(point["timestep"]):
             return None
         alpha, nu, step = (float(point[x]) for x in ("restitution", "packing_fraction", "timestep"))

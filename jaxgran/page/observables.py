@@ -172,7 +172,7 @@ def excess_lines(data: xr.Dataset) -> list[list[dict[str, Any]]]:
         return []
     x, y = refined_axes(data)
     shape = (-1, data.sizes["packing_fraction"], data.sizes["restitution"])
-    found = []
+    contours_of_fields = []
     for field in contour_variable(column(data["excess"], data)).reshape(shape):
         generator = contourpy.contour_generator(x, y, interpolated(field))
         contours = []
@@ -183,8 +183,8 @@ def excess_lines(data: xr.Dataset) -> list[list[dict[str, Any]]]:
             edge = points[np.isclose(points[:, 0], x.max()), 1]
             places = {"x": numbers(points[:, 0]), "y": numbers(points[:, 1])}
             contours.append({"text": f"{level:.2f}", **places, "edge": edge[:1].tolist()})
-        found.append(contours)
-    return found
+        contours_of_fields.append(contours)
+    return contours_of_fields
 
 
 def text_line(value: Any) -> str:

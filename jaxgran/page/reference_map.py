@@ -45,14 +45,14 @@ def reference_dataset() -> xr.Dataset:
             put(f"{path}_large_system_ci95", half)
     for name, values in table.series(table.points).items():
         put(f"theory/{name}", np.exp(values))
-    found = validity(*reversed(flows))
-    for name, error in found.error.items():
+    answer = validity(*reversed(flows))
+    for name, error in answer.error.items():
         put(
             f"{name}_error_of_theory",
             error,
             long_name="kinetic theory over measured average, less one",
         )
-        put(f"{name}_error_of_theory_ci95", found.error_ci95[name])
+        put(f"{name}_error_of_theory_ci95", answer.error_ci95[name])
     timestep = float(table.head["timestep"])
     attributes = {"title": f"The reference map of jaxgran: {table.made_with}", "timestep": timestep}
     return xr.Dataset(variables, dict(zip(_PLANE, axes, strict=True)), attributes)
@@ -79,10 +79,10 @@ def verdicts(packing_fractions: np.ndarray, restitutions: np.ndarray) -> dict[st
     )
     flows: list[dict[str, Any] | None] = [None] * len(nus)
     if inside.size:
-        found = validity(alphas[inside], nus[inside])
+        answers = validity(alphas[inside], nus[inside])
         for place, flow in enumerate(inside):
-            one = found.at(place)
-            flows[flow] = {"verdict": one.verdict(), "rows": one.rows()}
+            answer = answers.at(place)
+            flows[flow] = {"verdict": answer.verdict(), "rows": answer.rows()}
     return {
         "about": f"Reference map: {table.made_with}, diameters uniform in σ ± "
         f"{table.head['polydispersity']} σ; ± is half of the 95 % interval for a large system.",

@@ -121,7 +121,7 @@ def common_scale(networks: Iterable[ForceNetwork], colour: Colour) -> Scale:
     """One scale for several pictures, so that they can be compared."""
     networks = list(networks)
     values = np.concatenate([_values(network, colour) for network in networks])
-    return Scale(deepest(values), widest(np.concatenate([one.force for one in networks])))
+    return Scale(deepest(values), widest(np.concatenate([network.force for network in networks])))
 
 
 def _values(network: ForceNetwork, colour: Colour) -> Float[np.ndarray, " grains"]:

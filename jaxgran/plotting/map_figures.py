@@ -87,9 +87,9 @@ def save_figures(
     require_flag("overwrite", overwrite)
     stem = _writable(stem)
     drawn = {
-        stem.with_name(f"{stem.name}_{name}.{format}"): one.draw
-        for name, one in FIGURES.items()
-        if one.is_possible(data)
+        stem.with_name(f"{stem.name}_{name}.{format}"): figure.draw
+        for name, figure in FIGURES.items()
+        if figure.is_possible(data)
     }
     for path in drawn:
         if path.is_dir():

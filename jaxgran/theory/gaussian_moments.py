@@ -102,14 +102,14 @@ def steady_moments(
 
     Collisions lose 1/length of the energy that they lose in Enskog's theory.
     """
-    one = jnp.ones_like(rate)  # there is no other time scale, so T and stresses scale as γ̇²
+    unit_rate = jnp.ones_like(rate)  # there is no other time scale, so T and stresses scale as γ̇²
 
     def imbalance(unknowns):
         """Rate of change of each temperature tensor, relative to its trace."""
         tensors = _temperatures(unknowns)
         (xx, xy), (_, yy) = tensors
         shear = jnp.stack([2 * xy, jnp.zeros_like(yy), yy])
-        source = enskog_collisions(tensors, alpha, one, mixture, length).source
+        source = enskog_collisions(tensors, alpha, unit_rate, mixture, length).source
         return (source[[0, 1, 0], [0, 1, 1]] - shear) / (xx + yy)[None, :]
 
     start = (
@@ -119,7 +119,7 @@ def steady_moments(
     solution = jax.lax.custom_root(imbalance, start, _newton, _dense_solve)
 
     tensors = _temperatures(solution)
-    collisions = enskog_collisions(tensors, alpha, one, mixture, length)
+    collisions = enskog_collisions(tensors, alpha, unit_rate, mixture, length)
     densities = mixture.number_densities
     kinetic = jnp.sum(densities * jnp.trace(tensors)) / 2
     stress = jnp.sum(densities[None, None, :] * tensors, axis=-1) + collisions.stress
