@@ -17,7 +17,7 @@ import typer.main
 from made_up_maps import with_variables
 from synthetic import random_replica
 
-from jaxgran.cli import app, info, measure, merge, run, terminal
+from jaxgran.cli import app, info, merge, outcome, run, terminal
 from jaxgran.maps import results
 from jaxgran.maps.replica import Advance
 from jaxgran.model.status import Status
@@ -47,7 +47,7 @@ def jaxgran(folder: Path, *arguments: str) -> Outcome:
         patch.setenv("COLUMNS", "200")
         patch.setattr(sys, "argv", ["jaxgran", *arguments])
         patch.setattr(typer.main, "get_command", commands)
-        for module in (info, measure, merge, run):
+        for module in (info, outcome, merge, run):
             patch.setattr(module, "configured_jax", lambda: jax)
         status = terminal.exit_status(app.app)
     return Outcome(status, out.getvalue(), err.getvalue())

@@ -10,14 +10,14 @@ from typing import Any, get_args
 
 import numpy as np
 
-from jaxgran.cli.measure import (
+from jaxgran.cli.options import FILE, QUIET, command, of_map
+from jaxgran.cli.outcome import (
     entries,
     finish,
     print_large_system,
     run_map,
     told_how_to_resume,
 )
-from jaxgran.cli.options import FILE, QUIET, command, of_map
 from jaxgran.cli.output import JSON, print_json, print_table, print_text
 from jaxgran.cli.terminal import say_cache, say_written
 from jaxgran.maps.options import Option

@@ -4,8 +4,8 @@ import os
 from pathlib import Path
 
 from jaxgran.cli.map import MAP_OPTIONS, draw_beside, print_tables, require_new_figures
-from jaxgran.cli.measure import command_line, finish
 from jaxgran.cli.options import OVERWRITE, command
+from jaxgran.cli.outcome import command_line, finish
 from jaxgran.cli.terminal import configured_jax, require_device
 from jaxgran.maps.options import Option
 from jaxgran.maps.settings import OPTIONS

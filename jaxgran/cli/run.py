@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from jaxgran.cli.measure import entries, finish, print_large_system, run_map
 from jaxgran.cli.options import QUIET, command, of_map
+from jaxgran.cli.outcome import entries, finish, print_large_system, run_map
 from jaxgran.cli.output import JSON, print_json, print_table
 from jaxgran.cli.terminal import configured_jax, say, with_progress
 from jaxgran.io.paths import require_absent
@@ -70,7 +70,7 @@ RUN_OPTIONS["grains"] = replace(
 )
 
 
-def run_run_command(
+def simulate_flow(
     restitution: float,
     packing_fraction: float,
     trajectory: Path | None = None,
@@ -107,7 +107,7 @@ def run_run_command(
     finish(data, [output] if output is not None and written else [], interrupted, quiet, output)
 
 
-run_command = command(RUN_OPTIONS, run_run_command, required=("restitution", "packing_fraction"))
+run_command = command(RUN_OPTIONS, simulate_flow, required=("restitution", "packing_fraction"))
 
 
 def _recorded(files: Mapping[str, Path], chosen: Mapping[str, Any]) -> dict[str, Any]:
