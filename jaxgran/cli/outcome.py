@@ -210,7 +210,7 @@ def _print_large_system(data) -> None:
     else:
         title = (
             "Averages of a large system: correction for N, and half-widths of 95 % intervals by "
-            "source, in %: median (largest)"
+            "source, in %; median over the points (largest)"
         )
     if not _are_measured(data):
         title += f"\nExtrapolated: the corrections were measured at {MEASURED_FLOWS} only"
