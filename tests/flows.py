@@ -153,10 +153,10 @@ def packed():
 
     @cache
     def packing(packing_fraction: float, seed: int = 0) -> State:
-        state, found = compiled(
+        state, packed_below = compiled(
             ShearFlow(GRAINS, 0.5, packing_fraction, 1e-3), jax.random.key(seed)
         )
-        assert found
+        assert packed_below
         return state
 
     return packing

@@ -140,13 +140,13 @@ def move(hood: PairLists, grains: Grains, side, displacements, strain):
 def listed_pairs(listed) -> set:
     """The pairs of a list, each once."""
     i, j, reach = (np.asarray(x) for x in (listed.i, listed.j, listed.reach))
-    found = [
+    pairs = [
         tuple(sorted(pair))
         for pair in zip(i[reach > 0].tolist(), j[reach > 0].tolist(), strict=True)
     ]
-    assert len(found) == len(set(found))
-    assert all(i != j for i, j in found)
-    return set(found)
+    assert len(pairs) == len(set(pairs))
+    assert all(i != j for i, j in pairs)
+    return set(pairs)
 
 
 def pairs_within(gap: float, positions, radii, side, tilt) -> set:

@@ -38,14 +38,14 @@ def test_every_result_is_named_by_one_benchmark_and_every_name_is_there() -> Non
     assert all((output.RESULTS / file).is_file() for file in named)
 
 
-@pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda one: one.name)
+@pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda benchmark: benchmark.name)
 def test_run_takes_the_options_of_the_registry(benchmark) -> None:
     module = import_module(benchmark.module_name)
     options = [option.name.lstrip("-").replace("-", "_") for option in benchmark.options]
     first, *others = inspect.signature(module.run).parameters.values()
     assert first.name == "output"
-    assert [one.name for one in others] == options
-    assert all(one.default is not one.empty for one in others)
+    assert [parameter.name for parameter in others] == options
+    assert all(parameter.default is not parameter.empty for parameter in others)
     assert f"python -m benchmarks {benchmark.name}" in module.__doc__
 
 

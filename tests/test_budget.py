@@ -95,10 +95,10 @@ def test_law_of_the_size_is_the_fitted_one_and_its_bound_holds(average: str) -> 
     """Ratios of values at two N are those of the law within errors and spread, as often as 95 %
     intervals hold.
     """
-    found = json.loads((RESULTS / "size_limits.json").read_text())["laws"][average]["law"]
-    assert SIZE_LAWS[average][:5] == pytest.approx(found["constants"], rel=2e-3, abs=1e-4)
-    assert found["differences"] > 80
-    assert found["within"] >= 0.95 - 2 * np.sqrt(0.95 * 0.05 / found["differences"])
+    fitted = json.loads((RESULTS / "size_limits.json").read_text())["laws"][average]["law"]
+    assert SIZE_LAWS[average][:5] == pytest.approx(fitted["constants"], rel=2e-3, abs=1e-4)
+    assert fitted["differences"] > 80
+    assert fitted["within"] >= 0.95 - 2 * np.sqrt(0.95 * 0.05 / fitted["differences"])
 
 
 @pytest.mark.parametrize("average", LARGE_SYSTEM)

@@ -60,9 +60,9 @@ def test_blocks_find_the_events_of_a_pass_over_all_entries(shift: int) -> None:
         fields: dict = dict.fromkeys(Pairs._fields, np.zeros(1))
         bounds = np.zeros((2, (ENTRIES >> LEAST_SHIFT) + LANES), np.int32)
         pairs = Pairs(**fields | {"calendar": start.copy(), "bounds": bounds})
-        found = np.full((count, 2 + ENTRIES), -1)
-        events(blocks, changed, later, pairs, np.zeros(ENTRIES, np.uint32), found)
-        results.append(found)
+        events_found = np.full((count, 2 + ENTRIES), -1)
+        events(blocks, changed, later, pairs, np.zeros(ENTRIES, np.uint32), events_found)
+        results.append(events_found)
     whole, by_blocks = results
     assert np.all(np.diff(whole[:, 0]) >= 0) and len(set(whole[:, 0])) > count / 4
     assert whole[:, 1].min() >= 1 and whole[:, 1].max() > 1

@@ -40,12 +40,12 @@ def assert_whole(numbers, scale: float = 1.0):
 @cells
 def test_displacement_is_the_shortest_image(seed, side, tilt):
     to, origin = points(seed, side)
-    found = np.asarray(measured(to, origin, side, tilt))
+    displacements = np.asarray(measured(to, origin, side, tilt))
     shortest = nearest_image(to - origin, side, tilt)
-    assert_whole(lattice_coordinates(found - (to - origin), side, tilt))
+    assert_whole(lattice_coordinates(displacements - (to - origin), side, tilt))
     short = np.linalg.norm(shortest, axis=-1) < side / 2 * (1 - 4 * EPS)
-    np.testing.assert_allclose(found[short], shortest[short], rtol=0, atol=8 * EPS * side)
-    assert np.all(np.linalg.norm(found[~short], axis=-1) >= side / 2 * (1 - 8 * EPS))
+    np.testing.assert_allclose(displacements[short], shortest[short], rtol=0, atol=8 * EPS * side)
+    assert np.all(np.linalg.norm(displacements[~short], axis=-1) >= side / 2 * (1 - 8 * EPS))
 
 
 @modest

@@ -297,11 +297,11 @@ def test_a_movie_has_forty_frames_and_can_be_sent_by_mail(tmp_path: Path) -> Non
 
 def parsed(text: str) -> dict[str, Any]:
     """The JSON that a command prints: one object, in which every name has the same keys."""
-    found = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    entries = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert all(
-        list(entry) == ["value", "stderr", "ci95", "unit", "meaning"] for entry in found.values()
+        list(entry) == ["value", "stderr", "ci95", "unit", "meaning"] for entry in entries.values()
     )
-    return found
+    return entries
 
 
 def test_run_prints_rows_of_physics_or_json_of_every_average(small_run) -> None:
@@ -310,21 +310,21 @@ def test_run_prints_rows_of_physics_or_json_of_every_average(small_run) -> None:
     assert (
         "shear-stress ratio" in short.out and short.out.count("±") == 2 + 10 + 6
     )  # two headings, a row for each, and six averages of a large system
-    found, data = parsed(as_json.out), flattened(open_map(folder / "flow.nc")).squeeze()
+    printed, data = parsed(as_json.out), flattened(open_map(folder / "flow.nc")).squeeze()
     rows = {line[2:14].strip(): line.split() for line in short.out.splitlines()}  # the last of each
     for row, name in (("pressure", "pressure"), ("local T", "granular_temperature")):
         assert f"{data[f'theory/{name}'].item():.3g}" in rows[row]
-    assert as_json.status == short.status and set(OBSERVABLES) < set(found)
-    for name, one in OBSERVABLES.items():
+    assert as_json.status == short.status and set(OBSERVABLES) < set(printed)
+    for name, observable in OBSERVABLES.items():
         np.testing.assert_array_equal(
-            np.array(found[name]["value"], float), data[path_of(name)]
+            np.array(printed[name]["value"], float), data[path_of(name)]
         )  # null is NaN
-        if one.group != "diagnostics":
+        if observable.group != "diagnostics":
             np.testing.assert_array_equal(
-                np.array(found[name]["stderr"], float), data[f"{path_of(name)}_stderr"]
+                np.array(printed[name]["stderr"], float), data[f"{path_of(name)}_stderr"]
             )
-        assert found[name]["unit"] == one.unit
-    assert found["status"]["value"] in Status.__members__ and found["grains"]["value"] == 32
+        assert printed[name]["unit"] == observable.unit
+    assert printed["status"]["value"] in Status.__members__ and printed["grains"]["value"] == 32
 
 
 @pytest.mark.skipif(os.name != "posix", reason="a pipe of another kind")
@@ -387,8 +387,8 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
     for name in ("cache folder", "compiled programs", "numba engine", "figures"):
         folder, _, state = lines[name].partition(", ")
         assert Path(folder).is_dir() and state == "works", name
-    found = parsed(jaxgran(tmp_path, "info", "--json").out)
-    assert {name.replace(" ", "_") for name in lines} == set(found)
+    printed = parsed(jaxgran(tmp_path, "info", "--json").out)
+    assert {name.replace(" ", "_") for name in lines} == set(printed)
 
 
 def test_a_platform_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatch) -> None:

@@ -53,8 +53,8 @@ def test_below_the_threshold_steps_grow_and_the_excess_falls_by_the_roots(
     engines, discs, restitution
 ) -> None:
     exact = roots(discs, restitution)
-    found = slopes(exact, restitution, [row(discs, gap) for gap in GAPS], engines["numba"])
-    for values, expected in zip(found, (exact.steps_per_decade, exact.exponent), strict=True):
+    fitted = slopes(exact, restitution, [row(discs, gap) for gap in GAPS], engines["numba"])
+    for values, expected in zip(fitted, (exact.steps_per_decade, exact.exponent), strict=True):
         error = values.std(ddof=1) / np.sqrt(len(values))
         assert error < 0.1 * expected
         assert abs(values.mean() - expected) < 4 * error

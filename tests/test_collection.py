@@ -122,24 +122,24 @@ def test_committed_collection_is_the_one_of_its_summary_and_its_solutions_hold()
     told = json.loads((ROOT / "benchmarks" / "results" / "collection.json").read_text())
     assert hashlib.sha256(PATH.read_bytes()).hexdigest() == told["sha256"]
     entries = load()
-    sizes = [len(one.problem.approach) for one in entries]
+    sizes = [len(entry.problem.approach) for entry in entries]
     assert len(entries) == told["problems"] >= 200 and min(sizes) == 2 and max(sizes) > 2900
-    assert sum(not one.solution.feasible for one in entries) >= 7
-    for one in entries:
-        matrix, impulses, approach = one.matrix, one.solution.impulses, one.problem.approach
+    assert sum(not entry.solution.feasible for entry in entries) >= 7
+    for entry in entries:
+        matrix, impulses, approach = entry.matrix, entry.solution.impulses, entry.problem.approach
         if (
-            one.solution.feasible
+            entry.solution.feasible
         ):  # in double precision: for all; by the certificate: for every tenth
             after, own = matrix @ impulses + approach, matrix.diagonal()
             speed = np.linalg.norm(np.minimum(approach, 0))
             assert np.linalg.norm(np.minimum(own * impulses, after)) <= 1e-9 * speed
-            np.testing.assert_allclose(one.solution.velocities, after, rtol=0, atol=1e-9 * speed)
+            np.testing.assert_allclose(entry.solution.velocities, after, rtol=0, atol=1e-9 * speed)
             assert np.all(impulses >= 0)
-    for one in entries[::10]:
-        high, low = one.solution[1:3]
-        if one.solution.feasible:
-            assert certificate(one.problem, high, low) == pytest.approx(
-                one.solution.certificate, rel=1e-6, abs=1e-40
+    for entry in entries[::10]:
+        high, low = entry.solution[1:3]
+        if entry.solution.feasible:
+            assert certificate(entry.problem, high, low) == pytest.approx(
+                entry.solution.certificate, rel=1e-6, abs=1e-40
             )
         else:
-            assert obstacle(one.problem, high, low) < 1e-28
+            assert obstacle(entry.problem, high, low) < 1e-28

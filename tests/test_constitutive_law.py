@@ -68,10 +68,10 @@ def test_length_follows_from_correlated_velocities_where_collisions_are_binary()
     loss: L′ = 1/f.
     """
     alphas, nus = (x.ravel() for x in np.broadcast_arrays(*a_plane()))
-    found = jg.validity(alphas, nus)
-    binary = found.measured["force_ratio"] < 1.01
+    answer = jg.validity(alphas, nus)
+    binary = answer.measured["force_ratio"] < 1.01
     length = LAW(alphas, nus)._asdict()[LENGTH]
-    product = (length * np.sqrt(found.factors["chaos"]))[binary]
+    product = (length * np.sqrt(answer.factors["chaos"]))[binary]
     assert binary.sum() > 100
     assert np.all((product > 0.97) & (product < 1.05))
 

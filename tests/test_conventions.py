@@ -118,14 +118,14 @@ def test_a_number_of_grains_and_a_time_step_of_all_points_are_coordinates(
 ) -> None:
     assert {"point_grains", "timestep"} <= set(single.coords) and "grains" not in single.coords
     assert single.force_ratio.timestep.item() == 5e-4
-    one = made(grains=64, timestep=5e-4)
+    data = made(grains=64, timestep=5e-4)
     assert (
-        one.grains.item() == 64
-        and one.grains.dims == ()
-        and not {"grains", "timestep"} & set(one.data_vars)
+        data.grains.item() == 64
+        and data.grains.dims == ()
+        and not {"grains", "timestep"} & set(data.data_vars)
     )
-    write_dataset(one, tmp_path / "map.nc")
+    write_dataset(data, tmp_path / "map.nc")
     again = open_map(tmp_path / "map.nc")
-    assert set(again.coords) == set(one.coords)
+    assert set(again.coords) == set(data.coords)
     assert {"grains", "timestep"} <= set(again.force_ratio.encoding["coordinates"].split())
     assert again["stresses"].contact_stress.axis_b.values.tolist() == ["x", "y"]

@@ -33,42 +33,45 @@ def batched(laws_are_zero: bool = False):
 
 
 def test_without_corrections_the_theory_is_that_of_the_moments() -> None:
-    found, expected = (
+    predicted, expected = (
         batched(laws_are_zero=True)(*PLANE),
         jax.jit(jax.vmap(gaussian_moments))(*PLANE),
     )
     for name in STATE:
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-12)
-    np.testing.assert_array_equal(found.correlation_length, 1)
-    np.testing.assert_array_equal(found.pair_factor, 1)
+        np.testing.assert_allclose(getattr(predicted, name), getattr(expected, name), rtol=1e-12)
+    np.testing.assert_array_equal(predicted.correlation_length, 1)
+    np.testing.assert_array_equal(predicted.pair_factor, 1)
 
 
 def test_the_power_of_the_shear_is_dissipated() -> None:
-    found = batched()(*PLANE)
-    assert np.all(np.isfinite(found.pressure)) and np.all(found.granular_temperature > 0)
-    np.testing.assert_allclose(found.shear_stress, found.dissipation_rate, rtol=1e-12)
+    predicted = batched()(*PLANE)
+    assert np.all(np.isfinite(predicted.pressure)) and np.all(predicted.granular_temperature > 0)
+    np.testing.assert_allclose(predicted.shear_stress, predicted.dissipation_rate, rtol=1e-12)
 
 
 def test_dissipation_is_enskogs_times_pairs_over_length() -> None:
     """Of grains of one size, whose temperature tensor follows from stress and temperature."""
     alpha, nu = 0.4, 0.6
-    found = corrected_shear(alpha, nu, polydispersity=0.0)
-    density, total = 4 * nu / np.pi, np.array([found.pressure, found.shear_stress])
+    predicted = corrected_shear(alpha, nu, polydispersity=0.0)
+    density, total = 4 * nu / np.pi, np.array([predicted.pressure, predicted.shear_stress])
 
     def stresses(tensor):
         collisional = collisional_transfer(tensor, alpha, nu, polydispersity=0.0)
-        stress = density * tensor + found.pair_factor * collisional.stress
+        stress = density * tensor + predicted.pair_factor * collisional.stress
         return jnp.stack([jnp.trace(stress) / 2, -stress[0, 1]]), collisional.dissipation_rate
 
     def tensor_of(unknowns):
         difference, shear = unknowns
-        mean = found.granular_temperature
+        mean = predicted.granular_temperature
         return jnp.array([[mean + difference, shear], [shear, mean - difference]])
 
-    unknowns = jnp.array([0.1, -0.2]) * found.granular_temperature
+    unknowns = jnp.array([0.1, -0.2]) * predicted.granular_temperature
     misfit = jax.jit(lambda x: jnp.stack([stresses(tensor_of(x))[0][1], stresses(tensor_of(x))[1]]))
     target = jnp.stack(
-        [total[1], found.dissipation_rate * found.correlation_length / found.pair_factor]
+        [
+            total[1],
+            predicted.dissipation_rate * predicted.correlation_length / predicted.pair_factor,
+        ]
     )
     for _ in range(20):  # Newton: two unknowns of the tensor, from shear stress and dissipation
         unknowns = unknowns - jnp.linalg.solve(
@@ -95,8 +98,10 @@ def test_stresses_grow_with_the_square_of_the_shear_rate() -> None:
 @pytest.mark.parametrize("point", [(0.2, 0.3), (0.9, 0.8)])
 def test_derivatives_equal_finite_differences(point: tuple[float, float]) -> None:
     def logs(x):
-        found = corrected_shear(x[0], x[1])
-        return jnp.log(jnp.stack([found.granular_temperature, found.pressure, found.shear_stress]))
+        predicted = corrected_shear(x[0], x[1])
+        return jnp.log(
+            jnp.stack([predicted.granular_temperature, predicted.pressure, predicted.shear_stress])
+        )
 
     derivatives = jax.jacrev(logs)(jnp.array(point))
     steps = 1e-5 * np.eye(2)
@@ -140,7 +145,7 @@ def predicted_over_measured(points: list[dict], predicted: CorrectedShear) -> np
     """Logarithms for temperature, pressure and shear stress, (3, points)."""
     measured = np.array(
         [
-            [one[name] for one in points]
+            [point[name] for point in points]
             for name in ("local_temperature", "pressure", "shear_stress")
         ]
     )
@@ -152,9 +157,9 @@ def predicted_over_measured(points: list[dict], predicted: CorrectedShear) -> np
 
 def test_errors_at_flows_that_were_not_fitted_have_the_size_that_is_quoted() -> None:
     points = result()["judged_points"]
-    alpha, nu = (np.array([one[name] for one in points]) for name in ("alpha", "nu"))
-    assert not {one["alpha"] for one in result()["points"]} & set(alpha)
-    assert not {one["nu"] for one in result()["points"]} & set(nu)
+    alpha, nu = (np.array([point[name] for point in points]) for name in ("alpha", "nu"))
+    assert not {point["alpha"] for point in result()["points"]} & set(alpha)
+    assert not {point["nu"] for point in result()["points"]} & set(nu)
     errors = predicted_over_measured(points, batched()(alpha, nu))
     scatter = np.sqrt(np.mean(errors**2, axis=1))
     np.testing.assert_allclose(

@@ -33,9 +33,9 @@ def test_the_line_is_short_whatever_stands_in_the_place_of_a_number(value) -> No
 def test_answers_of_the_reference_map_are_shown_in_one_line() -> None:
     law, verdict = jg.constitutive_law(), jg.validity(0.6, [0.5, 0.65])
     assert repr(law) == "ConstitutiveLaw(restitution=0.05 to 0.98, packing_fraction=0.1 to 0.83)"
-    one = law(0.6, 0.65)
-    assert f"pressure={with_error(one.pressure, one.pressure_ci95)}, " in repr(one)
-    for value in (one, law(0.6, [0.5, 0.65]), verdict, verdict.at(0)):
+    answer = law(0.6, 0.65)
+    assert f"pressure={with_error(answer.pressure, answer.pressure_ci95)}, " in repr(answer)
+    for value in (answer, law(0.6, [0.5, 0.65]), verdict, verdict.at(0)):
         assert repr(value).startswith(type(value).__name__) and "ci95" not in repr(value)
         assert len(repr(value)) < 400 and "\n" not in repr(value)
 

@@ -104,11 +104,11 @@ def test_network_of_a_state_is_that_of_the_overlaps_by_brute_force(run, flowing)
     network, status = jax.jit(contacts_now)(flow, state)
     assert status == Status.ok
     gaps = gaps_of(state.positions, state.grains.radii, state.side, state.tilt)
-    found = {
+    pairs = {
         (min(i, j), max(i, j))
         for i, j in np.stack([network.i, network.j], axis=1)[np.asarray(network.used)]
     }
-    assert found == set(zip(*np.nonzero(gaps <= 0), strict=True)) and len(found) > 3
+    assert pairs == set(zip(*np.nonzero(gaps <= 0), strict=True)) and len(pairs) > 3
     depths = state.grains.radii[network.i] + state.grains.radii[network.j] - network.distances
     np.testing.assert_allclose(
         np.sort(depths[network.used]), np.sort(-gaps[gaps <= 0]), atol=64 * EPS
@@ -155,9 +155,9 @@ def test_sizes_of_the_contact_buffers_change_no_trajectory(
     state, flow = flowing(packing_fraction), flow_of(packing_fraction, restitution=0.1)
     expected, tally = run(flow, state, 50)
     monkeypatch.setattr(jax_engine, "contact_buffers", lambda grains: (2,))
-    found, other = jax.jit(advance_by_jax)(flow, EXACT, state, jnp.int32(50))
+    grown, other = jax.jit(advance_by_jax)(flow, EXACT, state, jnp.int32(50))
     assert tally.contacts > 2 * tally.solves or packing_fraction < 0.7
-    assert_same_state(found, expected, 1e-8)
+    assert_same_state(grown, expected, 1e-8)
     assert_same_tally(other, tally, 1e-8, but=("loaded_contacts",))
 
 
@@ -251,11 +251,11 @@ def test_control_flow_of_a_batch_stays_control_flow(traced_batch):
         contact_buffers(GRAINS)
     )  # the loops over lists and events, and a solve of each size and of all
     for name in ("cond", "while"):
-        found = [
+        equations = [
             each for each in equations_of(traced_batch.jaxpr.jaxpr) if each.primitive.name == name
         ]
-        assert len(found) >= least
-        for equation in found:
+        assert len(equations) >= least
+        for equation in equations:
             if name == "cond":
                 assert equation.invars[0].aval.shape == ()
             else:  # a batched predicate would be reduced over the replicas outside pmax

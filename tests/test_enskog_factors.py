@@ -180,12 +180,12 @@ def test_long_waves_change_the_granular_temperature_alone() -> None:
 
 def momentum_and_energy(temperature: float) -> dict[str, float]:
     """Enskog's contact stresses and dissipation rate at an isotropic temperature."""
-    found = collisional_transfer(temperature * np.eye(2), ALPHA, NU, polydispersity=0.0)
-    stress = np.asarray(found.stress)
+    transfer = collisional_transfer(temperature * np.eye(2), ALPHA, NU, polydispersity=0.0)
+    stress = np.asarray(transfer.stress)
     return {
         "pressure": np.trace(stress) / 2,
         "shear_stress": -stress[0, 1],
-        "dissipation_rate": float(found.dissipation_rate),
+        "dissipation_rate": float(transfer.dissipation_rate),
     }
 
 

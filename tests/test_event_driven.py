@@ -76,8 +76,8 @@ def test_elastic_gas_has_the_rate_and_pressure_of_enskog() -> None:
     fraction, count = 0.3, 400
     gas, _ = sheared(lattice(20, fraction, polydispersity=0.0), Law(1.0, shear_rate=0.0), 10.0)
     gas, sums = sheared(gas, Law(1.0, shear_rate=0.0), 80.0, blocks=16)
-    found = averages(sums, gas)
-    np.testing.assert_allclose(found["granular_temperature"], 1, rtol=1e-9)
+    values = averages(sums, gas)
+    np.testing.assert_allclose(values["granular_temperature"], 1, rtol=1e-9)
     chi, density = (1 - 7 * fraction / 16) / (1 - fraction) ** 2, 4 * fraction / np.pi
     expected = {
         "collision_rate": 2
@@ -88,6 +88,6 @@ def test_elastic_gas_has_the_rate_and_pressure_of_enskog() -> None:
         "pressure": density * (1 + 2 * fraction * chi),
     }
     for name, value in expected.items():
-        error = found[name].std(ddof=1) / np.sqrt(len(found[name]))
+        error = values[name].std(ddof=1) / np.sqrt(len(values[name]))
         assert error < 0.01 * value
-        assert abs(found[name].mean() - value) < 4 * error + 0.003 * value
+        assert abs(values[name].mean() - value) < 4 * error + 0.003 * value

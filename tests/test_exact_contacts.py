@@ -69,9 +69,11 @@ def test_pressed_hexagon_stops(rings):
         for axis in np.meshgrid(np.arange(-rings, rings + 1), np.arange(-rings, rings + 1))
     )
     places = np.stack([a + b / 2, b * np.sqrt(3) / 2], axis=-1)[np.abs(a + b) <= rings]
-    found = exact(network.contacts, network.masses)
-    assert found.feasible and found.residual < 1e-14
-    np.testing.assert_allclose(found.changes[: len(places)], places, rtol=0, atol=100 * EPS * rings)
+    solution = exact(network.contacts, network.masses)
+    assert solution.feasible and solution.residual < 1e-14
+    np.testing.assert_allclose(
+        solution.changes[: len(places)], places, rtol=0, atol=100 * EPS * rings
+    )
 
 
 def test_both_methods_find_the_same_velocities():

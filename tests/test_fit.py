@@ -49,30 +49,32 @@ def fit(seed: int, steps: int = STEPS, **options) -> tuple[TrajectoryFit, jg.Sta
 
 
 def test_restitution_is_found_within_its_error_bar() -> None:
-    found = [fit(seed)[0] for seed in range(4)]
-    pulls = [(one.restitution - TRUTH) / one.stderr for one in found]
+    fits = [fit(seed)[0] for seed in range(4)]
+    pulls = [(result.restitution - TRUTH) / result.stderr for result in fits]
     assert np.sum(np.abs(pulls) < 2) >= 3 and np.max(np.abs(pulls)) < 4, pulls
-    for one in found:
-        assert 1e-4 < one.stderr < 0.02
-        assert one.misfit[0] > 5 * one.misfit[-1] and one.misfit[-1] == pytest.approx(1, abs=0.5)
-        assert one.velocities is None and one.positions is None
+    for result in fits:
+        assert 1e-4 < result.stderr < 0.02
+        assert result.misfit[0] > 5 * result.misfit[-1] and result.misfit[-1] == pytest.approx(
+            1, abs=0.5
+        )
+        assert result.velocities is None and result.positions is None
 
 
 def test_states_at_the_start_are_found_better_than_they_were_seen_or_the_fit_is_refused() -> None:
     """Noise at the start may lead to other collisions, at which the misfit stays above what noise
     explains.
     """
-    found = {}
+    fits = {}
     for seed in range(4):
         with suppress(jg.InputError):
-            found[seed] = fit(seed, velocities=True, positions=True)
-    assert len(found) >= 2
-    for seed, (one, start) in found.items():
-        assert abs(one.restitution - TRUTH) < 4 * one.stderr
-        assert one.stderr > fit(seed)[0].stderr  # what is not known costs precision
-        assert one.velocities is not None and one.positions is not None
-        assert np.std(one.velocities - start.velocities) < 0.9 * VELOCITY
-        assert np.std(one.positions - start.positions) < 0.9 * POSITION
+            fits[seed] = fit(seed, velocities=True, positions=True)
+    assert len(fits) >= 2
+    for seed, (result, start) in fits.items():
+        assert abs(result.restitution - TRUTH) < 4 * result.stderr
+        assert result.stderr > fit(seed)[0].stderr  # what is not known costs precision
+        assert result.velocities is not None and result.positions is not None
+        assert np.std(result.velocities - start.velocities) < 0.9 * VELOCITY
+        assert np.std(result.positions - start.positions) < 0.9 * POSITION
 
 
 def test_windows_beyond_the_horizon_are_refused() -> None:

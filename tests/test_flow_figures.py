@@ -105,9 +105,11 @@ def test_bars_join_the_centres_of_grains_that_push_in_widths_by_their_forces() -
 
 
 def test_colours_are_the_speed_and_the_pressure_of_the_contacts() -> None:
-    one = seen()
-    network = network_of(one)
-    np.testing.assert_allclose(network.speed, np.linalg.norm(one.state.velocities[0], axis=-1))
+    snapshots = seen()
+    network = network_of(snapshots)
+    np.testing.assert_allclose(
+        network.speed, np.linalg.norm(snapshots.state.velocities[0], axis=-1)
+    )
     pushed = np.zeros(GRAINS)
     pushed[:5] = 2.0, 3.0, 1.0, 0.5, 0.5
     np.testing.assert_allclose(pressures(network), pushed * 0.5 / (2 * np.pi * 0.25))
@@ -190,13 +192,13 @@ def test_gif_has_all_frames_and_they_differ(flows: int, tmp_path: Path) -> None:
 def test_too_many_frames_are_thinned_evenly(monkeypatch) -> None:
     monkeypatch.setattr(movie, "MOST_DRAWN", 8)
     frames = Frames()
-    one = seen_once(0)
+    snapshot = seen_once(0)
     for step in range(50):
-        frames.keep(one, step)
+        frames.keep(snapshot, step)
     strains = [frame.strain for frame in frames.frames]
     assert 4 <= len(strains) <= 8
     assert len(set(np.diff(strains))) == 1 and strains[0] == 0
-    frames.keep(one, 0)
+    frames.keep(snapshot, 0)
     assert [frame.strain for frame in frames.frames] == [0.0]
 
 

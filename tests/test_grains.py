@@ -24,13 +24,13 @@ def test_sample_is_a_stratified_uniform_distribution(count, polydispersity):
 
 
 def test_key_permutes_the_sizes_and_nothing_else():
-    one, two, again = (
+    first, second, again = (
         np.asarray(polydisperse(64, 0.26, jax.random.key(seed)).radii) for seed in (0, 1, 0)
     )
-    np.testing.assert_array_equal(one, again)
-    np.testing.assert_array_equal(np.sort(one), np.sort(two))
-    assert np.mean(one == two) < 0.2
-    neighbours = np.corrcoef(one[1:], one[:-1])[0, 1]
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(np.sort(first), np.sort(second))
+    assert np.mean(first == second) < 0.2
+    neighbours = np.corrcoef(first[1:], first[:-1])[0, 1]
     assert abs(neighbours) < 4 / np.sqrt(
         63
     )  # standard error of a correlation of independent numbers

@@ -218,25 +218,25 @@ def test_sums_over_200_steps_are_those_of_the_classical_loop(
         kinetic = sum(
             w * np.einsum("i,ia,ib->ab", grains.masses, c, c) for w, c in simpson(begin, at[1])
         )
-        one = (
+        step_sums = (
             step.impulse,
             step.binary_impulse,
             *step.contact_stress,
             *step.binary_stress,
             *symmetric(kinetic),
         )
-        sums += one
+        sums += step_sums
     area = float(state.side) ** 2
     assert float(tally.collisions) > 5
     moments = (np.asarray(tally.contact_moment), np.asarray(tally.binary_moment))
-    found = [
+    tally_sums = [
         tally.impulse,
         tally.binary_impulse,
         *(x for m in moments for x in symmetric(m) / (area * DT)),
     ]
-    found = np.array([*found, *symmetric(np.asarray(tally.kinetic_moment)) / DT], float)
+    tally_sums = np.array([*tally_sums, *symmetric(np.asarray(tally.kinetic_moment)) / DT], float)
     scale = np.repeat([np.max(np.abs(part)) for part in np.split(sums, [2, 5, 8])], [2, 3, 3, 3])
-    np.testing.assert_allclose(found / scale, sums / scale, atol=1e-6)
+    np.testing.assert_allclose(tally_sums / scale, sums / scale, atol=1e-6)
     moved = displacement(after.positions, jnp.asarray(at[0]), after.side, after.tilt)
     np.testing.assert_allclose(moved, 0, atol=1e-7)
     np.testing.assert_allclose(after.velocities, at[1], atol=1e-6)

@@ -90,11 +90,11 @@ def test_collisions_are_those_of_the_velocities_in_the_source(restitution):
     kurtosis = (
         16 * (1 - alpha) * (1 - 2 * alpha**2) / (57 - 25 * alpha + 30 * alpha**2 * (1 - alpha))
     )
-    found = garzo_dufty(alpha, nu)
+    predicted = garzo_dufty(alpha, nu)
     maxwellian = maxwellian_collision_rate(
-        4 * nu / np.pi, contact_value(nu), found.granular_temperature
+        4 * nu / np.pi, contact_value(nu), predicted.granular_temperature
     )
-    excess = float(found.collision_rate / maxwellian) - 1
+    excess = float(predicted.collision_rate / maxwellian) - 1
     assert abs(excess) > 1e-4
     assert excess == pytest.approx(
         change * kurtosis, rel=0.1
@@ -127,9 +127,9 @@ def test_stresses_grow_with_the_square_of_the_shear_rate(theory):
 @pytest.mark.parametrize("packing_fraction", [0.05, 0.4, 0.8])
 def test_theories_of_one_size_agree_in_the_elastic_limit(packing_fraction):
     def distance(restitution):
-        found = moments(restitution, packing_fraction, 1.0, 0.0)
+        predicted = moments(restitution, packing_fraction, 1.0, 0.0)
         return np.abs(
-            numbers(found) / numbers(garzo_dufty(restitution, packing_fraction)) - 1
+            numbers(predicted) / numbers(garzo_dufty(restitution, packing_fraction)) - 1
         ).max()
 
     assert distance(1 - 1e-4) < 1e-3
@@ -173,13 +173,13 @@ def test_collisional_transfer_of_slow_shear_has_the_viscosity_of_isotropic_colli
     vanishing shear.
     """
     alpha, nu, rate, temperature = 0.8, 0.5, 1e-4, 2.0
-    found = collisional_transfer(temperature * jnp.eye(2), alpha, nu, rate, 0.0)
+    transfer = collisional_transfer(temperature * jnp.eye(2), alpha, nu, rate, 0.0)
     bulk = 8 / np.pi * nu**2 * float(contact_value(nu)) * (1 + alpha)
     np.testing.assert_allclose(
-        -found.stress[0, 1] / rate, bulk / 2 * np.sqrt(temperature / (4 * np.pi)), rtol=1e-6
+        -transfer.stress[0, 1] / rate, bulk / 2 * np.sqrt(temperature / (4 * np.pi)), rtol=1e-6
     )
     speed = (
-        found.speed_stress[0, 0] / found.stress[0, 0]
+        transfer.speed_stress[0, 0] / transfer.stress[0, 0]
     )  # ⟨w³⟩ / ⟨w²⟩ of a half-Gaussian of variance 2T
     np.testing.assert_allclose(speed, 2 * np.sqrt(2 / np.pi) * np.sqrt(2 * temperature), rtol=1e-6)
 

@@ -41,18 +41,18 @@ def study(noise: float, seed: int = 0) -> list[dict]:
 
 
 def test_the_law_that_made_the_averages_is_found_within_its_errors() -> None:
-    found = law_of(flows_of(study(1e-3), AVERAGES[0]), spread=0.5)
-    assert np.all(abs(np.array(found["constants"]) - LAW) < 4 * np.array(found["stderrs"]))
-    assert found["chi_squared"] / found["freedom"] == pytest.approx(
-        1, abs=4 * np.sqrt(2 / found["freedom"])
+    law = law_of(flows_of(study(1e-3), AVERAGES[0]), spread=0.5)
+    assert np.all(abs(np.array(law["constants"]) - LAW) < 4 * np.array(law["stderrs"]))
+    assert law["chi_squared"] / law["freedom"] == pytest.approx(
+        1, abs=4 * np.sqrt(2 / law["freedom"])
     )
 
 
 def test_the_shared_exponent_is_in_its_interval_and_chi_squared_excludes_a_logarithm() -> None:
     flows = [flow for flow in flows_of(study(1e-3), AVERAGES[0]) if flow.packing_fraction <= 0.7]
-    found = exponents(flows)
-    assert found["freedom"] == 30
-    assert found["interval"][0] < LAW[0] < found["interval"][1]
-    assert found["chi_squared"]["ln N"] > found["best"][1] + 50
-    for flow, one in zip(flows, limits_of(flows, found["interval"]), strict=True):
-        assert one["interval"][0] - 4e-3 < 2 < one["interval"][1] + 4e-3, flow
+    fit = exponents(flows)
+    assert fit["freedom"] == 30
+    assert fit["interval"][0] < LAW[0] < fit["interval"][1]
+    assert fit["chi_squared"]["ln N"] > fit["best"][1] + 50
+    for flow, limit in zip(flows, limits_of(flows, fit["interval"]), strict=True):
+        assert limit["interval"][0] - 4e-3 < 2 < limit["interval"][1] + 4e-3, flow

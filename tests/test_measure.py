@@ -83,14 +83,14 @@ def test_a_change_of_numbers_compiles_nothing_anew(state, measured) -> None:
 
 def test_averages_are_those_of_all_blocks_together() -> None:
     tally = random_tally(np.random.default_rng(0), BLOCKS)
-    one = Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS)
-    assert one.force_ratio == pytest.approx(tally.impulse.sum() / tally.binary_impulse.sum())
+    sample = Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS)
+    assert sample.force_ratio == pytest.approx(tally.impulse.sum() / tally.binary_impulse.sum())
     stress = (
         (tally.contact_moment + tally.kinetic_moment).sum(axis=0) / tally.duration.sum() / 100.0
     )
-    assert one.pressure == pytest.approx(np.trace(stress) / 2)
-    assert one.shear_stress == pytest.approx(-stress[0, 1])
-    assert one.averages["max_overlap"] == tally.largest_overlap.max()
+    assert sample.pressure == pytest.approx(np.trace(stress) / 2)
+    assert sample.shear_stress == pytest.approx(-stress[0, 1])
+    assert sample.averages["max_overlap"] == tally.largest_overlap.max()
     for name in (
         "granular_temperature",
         "contact_stress",
@@ -98,7 +98,7 @@ def test_averages_are_those_of_all_blocks_together() -> None:
         "kinetic_stress",
         "stress_ratio",
     ):
-        np.testing.assert_array_equal(getattr(one, name), one.averages[name])
+        np.testing.assert_array_equal(getattr(sample, name), sample.averages[name])
 
 
 def test_deep_overlaps_are_judged_by_their_share_of_all_contacts_of_a_sample() -> None:
@@ -121,14 +121,14 @@ def test_averages_and_errors_are_computed_once_and_cannot_be_written_to(monkeypa
         sample_module, "averages", lambda *x, **y: (calls.append(1), averages(*x, **y))[1]
     )
     tally = random_tally(np.random.default_rng(2), BLOCKS)
-    one = Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS)
-    once = (one.pressure, one.contact_stress, one.errors()["pressure"], len(calls))
-    again = (one.pressure, one.contact_stress, one.errors()["pressure"], len(calls))
+    sample = Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS)
+    once = (sample.pressure, sample.contact_stress, sample.errors()["pressure"], len(calls))
+    again = (sample.pressure, sample.contact_stress, sample.errors()["pressure"], len(calls))
     assert all(map(np.array_equal, once, again))
-    one.averages["pressure"] = one.errors()["pressure"] = 0.0  # of a copy
-    assert one.pressure == once[0] and one.errors()["pressure"] == once[2]
+    sample.averages["pressure"] = sample.errors()["pressure"] = 0.0  # of a copy
+    assert sample.pressure == once[0] and sample.errors()["pressure"] == once[2]
     with pytest.raises(ValueError, match="read-only"):
-        one.contact_stress[0, 0] = 0.0
+        sample.contact_stress[0, 0] = 0.0
 
 
 def test_errors_of_a_batch_are_those_of_each_replica_which_an_index_takes() -> None:
@@ -137,9 +137,9 @@ def test_errors_of_a_batch_are_those_of_each_replica_which_an_index_takes() -> N
     )
     errors = both.errors()
     assert set(errors) == set(OBSERVABLES)
-    for k, one in enumerate(both):
-        jax.tree.map(np.testing.assert_array_equal, one, replica(both, k))
-        for name, error in one.errors().items():
+    for k, single in enumerate(both):
+        jax.tree.map(np.testing.assert_array_equal, single, replica(both, k))
+        for name, error in single.errors().items():
             np.testing.assert_array_equal(errors[name][k], error)
     np.testing.assert_array_equal(both[1:].pressure, both.pressure[1:])
     with pytest.raises(IndexError):
@@ -153,7 +153,9 @@ def test_errors_of_a_batch_are_those_of_each_replica_which_an_index_takes() -> N
 def test_averages_of_a_sample_are_of_numpy_and_those_that_jax_traces(measured) -> None:
     """JAX would compile dozens of small sums at the first access."""
     assert all(isinstance(x, np.ndarray | np.generic) for x in measured[1].averages.values())
-    traced = jax.jit(lambda one: (one.averages, one.status))(measured[1])
+    traced = jax.jit(lambda traced_sample: (traced_sample.averages, traced_sample.status))(
+        measured[1]
+    )
     jax.tree.map(
         partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-15), traced[0], measured[1].averages
     )
@@ -209,7 +211,7 @@ def test_a_sample_below_four_correlation_strains_says_so_however_it_is_taken(sta
 
 
 def test_spread_of_the_largest_of_one_block_is_unknown() -> None:
-    one = Sample(
+    block = Sample(
         random_tally(np.random.default_rng(2), 1), np.float64(100.0), np.float64(1.0), GRAINS
     )
-    assert np.isnan(one.errors()["max_overlap"]) and np.isnan(one.errors()["pressure"])
+    assert np.isnan(block.errors()["max_overlap"]) and np.isnan(block.errors()["pressure"])

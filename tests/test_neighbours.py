@@ -71,8 +71,8 @@ def all_images(positions, side, tilt, cutoff):
     near = cKDTree(np.concatenate(images)).query_ball_point(positions, cutoff)
     return {
         (i, k % len(positions))
-        for i, found in enumerate(near)
-        for k in found
+        for i, pairs in enumerate(near)
+        for k in pairs
         if i < k % len(positions)
     }
 
@@ -80,10 +80,10 @@ def all_images(positions, side, tilt, cutoff):
 def found_pairs(i, j):
     """The pairs found, after a check that each is found once and in order."""
     i, j = np.asarray(i), np.asarray(j)
-    found = list(zip(i[i != j].tolist(), j[i != j].tolist(), strict=True))
-    assert len(set(found)) == len(found)
-    assert all(a < b for a, b in found)
-    return set(found)
+    pairs = list(zip(i[i != j].tolist(), j[i != j].tolist(), strict=True))
+    assert len(set(pairs)) == len(pairs)
+    assert all(a < b for a, b in pairs)
+    return set(pairs)
 
 
 @pytest.mark.parametrize("clustered", [False, True])
@@ -170,7 +170,7 @@ def test_set_bit_is_the_place_of_the_bit_of_that_rank():
     words = np.random.default_rng(0).integers(0, 2**32, 50, dtype=np.uint32)
     words[:3] = 1, 2**31, 2**32 - 1
     ranks = np.tile(np.arange(32, dtype=np.int32), len(words))
-    found = jax.jit(set_bit)(np.repeat(words, 32), ranks).reshape(-1, 32)
-    for word, row in zip(words, found, strict=True):
+    rows = jax.jit(set_bit)(np.repeat(words, 32), ranks).reshape(-1, 32)
+    for word, row in zip(words, rows, strict=True):
         places = [k for k in range(32) if int(word) >> k & 1]
         assert row[: len(places)].tolist() == places

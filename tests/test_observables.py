@@ -76,8 +76,8 @@ def tally(microscopic) -> Tally:
 
 @pytest.fixture(scope="module")
 def measured(tally) -> dict[str, np.ndarray]:
-    found = averages(tally, np.float64(AREA), GRAINS, np.float64(SHEAR_RATE))
-    return {name: np.asarray(value) for name, value in found.items()}
+    values = averages(tally, np.float64(AREA), GRAINS, np.float64(SHEAR_RATE))
+    return {name: np.asarray(value) for name, value in values.items()}
 
 
 def stress_over_steps(microscopic, impulses: str) -> np.ndarray:
@@ -153,13 +153,15 @@ def test_powers_are_shares_of_the_shear_work(tally, measured) -> None:
 
 def test_leading_axes_are_kept() -> None:
     tally = random_tally(np.random.default_rng(1), 3, 4)
-    found = averages(tally, np.full((3, 4), AREA), GRAINS, np.full((3, 4), SHEAR_RATE))
-    for name, value in found.items():
+    values = averages(tally, np.full((3, 4), AREA), GRAINS, np.full((3, 4), SHEAR_RATE))
+    for name, value in values.items():
         assert value.shape == (3, 4, *OBSERVABLES[name].shape), name
 
 
 def test_quotient_of_nothing_is_nan_without_a_warning() -> None:
-    found = averages(empty_tally(np.dtype(float)), np.float64(AREA), GRAINS, np.float64(SHEAR_RATE))
+    values = averages(
+        empty_tally(np.dtype(float)), np.float64(AREA), GRAINS, np.float64(SHEAR_RATE)
+    )
     for name in (
         "force_ratio",
         "iterations",
@@ -167,10 +169,10 @@ def test_quotient_of_nothing_is_nan_without_a_warning() -> None:
         "stress_ratio",
         "cluster_pressure_share",
     ):
-        assert np.isnan(found[name]).all(), name
+        assert np.isnan(values[name]).all(), name
 
 
 def test_every_observable_is_measured_with_a_unit(measured) -> None:
     assert set(measured) == set(OBSERVABLES)
-    for name, one in OBSERVABLES.items():
-        assert one.meaning and one.unit and measured[name].shape == one.shape
+    for name, observable in OBSERVABLES.items():
+        assert observable.meaning and observable.unit and measured[name].shape == observable.shape

@@ -29,6 +29,6 @@ def test_no_packing_of_many_has_an_overlap(packed, packing_fraction):
 
 
 def test_packing_follows_from_the_key(packed):
-    one, two, again = packed(0.7, 0), packed(0.7, 1), packed.__wrapped__(0.7, 0)
-    np.testing.assert_array_equal(one.positions, again.positions)
-    assert not np.any(one.positions == two.positions)
+    first, second, again = packed(0.7, 0), packed(0.7, 1), packed.__wrapped__(0.7, 0)
+    np.testing.assert_array_equal(first.positions, again.positions)
+    assert not np.any(first.positions == second.positions)

@@ -44,12 +44,14 @@ def written(page: Page) -> dict:
 
 def by_name(page: dict) -> dict[str, dict]:
     """The observables of a page by their names, without units."""
-    labels = {one["label"]: one for one in page["observables"]}
-    return {label.split(" (")[0].replace(" ", "_"): one for label, one in labels.items()}
+    labels = {observable["label"]: observable for observable in page["observables"]}
+    return {
+        label.split(" (")[0].replace(" ", "_"): observable for label, observable in labels.items()
+    }
 
 
-def values(one: dict) -> list:
-    return one["views"][0]["scales"][0]["z"]
+def values(observable: dict) -> list:
+    return observable["views"][0]["scales"][0]["z"]
 
 
 def assert_same_numbers(shown: list, expected: np.ndarray) -> None:
@@ -79,12 +81,15 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
                 component = shown[f"{name}_{'xy'[a]}{'xy'[b]}"]
                 assert_same_numbers(values(component), data[path_of(name)].values[..., a, b])
             continue
-        one, average = shown[name], data[path_of(name)]
+        shown_observable, average = shown[name], data[path_of(name)]
         error = data.get(f"{path_of(name)}_stderr")
-        view, (text, theory, samples, large) = one["views"][0], one["texts"]
-        assert one["meaning"] == observable.meaning
-        assert (observable.unit == "1") == (one["label"] == name.replace("_", " "))
-        assert_same_numbers(values(one), average.transpose(*dims).values)
+        view, (text, theory, samples, large) = (
+            shown_observable["views"][0],
+            shown_observable["texts"],
+        )
+        assert shown_observable["meaning"] == observable.meaning
+        assert (observable.unit == "1") == (shown_observable["label"] == name.replace("_", " "))
+        assert_same_numbers(values(shown_observable), average.transpose(*dims).values)
         if observable.group != "diagnostics":
             assert_same_numbers(view["error"], error.transpose(*dims).values)
         assert ("theory" in view) == (theory is not None) == (f"theory/{name}" in data)
@@ -92,11 +97,11 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
             assert_same_numbers(view["theory"], data[f"theory/{name}"].values)
             of_theory = data.get(f"{name}_large_system", average).transpose(*dims)
             quotient = of_theory.values / data[f"theory/{name}"].values
-            assert_same_numbers(one["views"][1]["scales"][0]["z"], quotient)
+            assert_same_numbers(shown_observable["views"][1]["scales"][0]["z"], quotient)
         if "theory" in view and f"{name}_large_system" in data:
             half = data[f"{name}_large_system_ci95"].sel(error_source="total").transpose(*dims)
             errors = half.values / HALF_INTERVAL / data[f"theory/{name}"].values
-            assert_same_numbers(one["views"][1]["error"], errors)
+            assert_same_numbers(shown_observable["views"][1]["error"], errors)
         assert (large is not None) == (f"{name}_large_system" in data)
         if large is not None:
             half_width = data[f"{name}_large_system_ci95"].sel(error_source="total")
@@ -114,7 +119,7 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
 
 
 def texts_of(page: dict, choice: str) -> list[str]:
-    return next(one["texts"] for one in page["choices"] if one["name"] == choice)
+    return next(axis["texts"] for axis in page["choices"] if axis["name"] == choice)
 
 
 @pytest.mark.parametrize("log", [False, True])
@@ -133,28 +138,30 @@ def test_levels_are_round_numbers_within_the_values_where_the_scale_has_them(log
 def test_points_without_a_number_and_with_a_bad_status_are_told_apart(found) -> None:
     """Point 8 of the settings was not run; the shorter time step comes first on a page."""
     assert found["bad"] == [False, True, True, *[False] * 9]
-    assert [one is None for one in values(found["observables"][0])] == [k == 2 for k in range(12)]
-    assert [one is None for one in found["instants"]] == [k == 2 for k in range(12)]
+    assert [value is None for value in values(found["observables"][0])] == [
+        k == 2 for k in range(12)
+    ]
+    assert [value is None for value in found["instants"]] == [k == 2 for k in range(12)]
     assert found["status"][0] == "Status ok."
     assert found["status"][1].startswith("Status deep overlap: ")
 
 
 def test_instant_is_packed_without_visible_loss() -> None:
-    one = random_instant(1, grains=50, pairs=9)
-    packed, unit = grain_data(one), one.side / PARTS
+    instant = random_instant(1, grains=50, pairs=9)
+    packed, unit = grain_data(instant), instant.side / PARTS
     grains, bars = (np.frombuffer(base64.b64decode(packed[x]), "<i2") for x in ("grains", "bars"))
     x, y, radius, colour = grains.reshape(4, -1)
-    which, centres = grain_images(one)
+    which, centres = grain_images(instant)
     assert set(which) == set(range(50)) and len(which) > 50
     np.testing.assert_allclose(np.stack([x, y], axis=-1) * unit, centres, atol=unit)
-    np.testing.assert_allclose(radius * unit, one.radii[which], atol=unit)
-    share = np.minimum(one.speed / common_scale([one], "speed").colour, 1)
+    np.testing.assert_allclose(radius * unit, instant.radii[which], atol=unit)
+    share = np.minimum(instant.speed / common_scale([instant], "speed").colour, 1)
     np.testing.assert_allclose(colour / 63, share[which], atol=1 / 126)
-    pairs, middles, along, widths = bar_images(one, common_scale([one], "speed").force)
+    pairs, middles, along, widths = bar_images(instant, common_scale([instant], "speed").force)
     *lengths, clustered = bars.reshape(6, -1)
     expected = [*middles.T, *along.T, widths]
     np.testing.assert_allclose(np.multiply(lengths, unit), expected, atol=unit)
-    np.testing.assert_array_equal(clustered, one.clustered[pairs])
+    np.testing.assert_array_equal(clustered, instant.clustered[pairs])
 
 
 def test_numbers_of_grains_are_an_axis_or_stand_at_their_points() -> None:
@@ -224,10 +231,10 @@ def test_a_page_has_the_verdict_on_every_flow_in_the_range_of_the_reference_map(
     for flow, (nu, alpha) in zip(
         said["flows"][2:], [(nu, alpha) for nu in nus[1:] for alpha in alphas], strict=True
     ):
-        found = jg.validity(alpha, nu)
-        assert flow["verdict"] == found.verdict()
+        answer = jg.validity(alpha, nu)
+        assert flow["verdict"] == answer.verdict()
         assert [row[0] for row in flow["rows"]] == [
-            name.replace("_", " ") for name in found.measured
+            name.replace("_", " ") for name in answer.measured
         ]
         assert all(len(row) == len(said["columns"]) for row in flow["rows"])
 

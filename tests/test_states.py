@@ -43,24 +43,28 @@ def test_forces_of_a_state_act_between_grains_that_touch(with_states) -> None:
     pairs = 0
     for point, state in first_of_points(with_states).items():
         assert np.pi * np.sum(state.grains.radii**2) / state.side**2 == pytest.approx(0.8)
-        found = instant_at(state, SETTINGS.restitution[point], 0.8, 5e-4, "midpoint")
-        i, j = found.pairs.T
+        instant = instant_at(state, SETTINGS.restitution[point], 0.8, 5e-4, "midpoint")
+        i, j = instant.pairs.T
         apart = np.hypot(
-            *minimum_image(found.positions[i] - found.positions[j], found.side, found.tilt).T
+            *minimum_image(
+                instant.positions[i] - instant.positions[j], instant.side, instant.tilt
+            ).T
         )
-        near = found.radii[i] + found.radii[j] + 5e-4 * (found.speed[i] + found.speed[j] + 2)
-        assert np.all(found.force > 0) and np.all(apart < near)
-        pairs += len(found.force)
+        near = (
+            instant.radii[i] + instant.radii[j] + 5e-4 * (instant.speed[i] + instant.speed[j] + 2)
+        )
+        assert np.all(instant.force > 0) and np.all(apart < near)
+        pairs += len(instant.force)
     assert pairs
 
 
 def test_bad_replicas_give_no_state(with_states) -> None:
-    found = dict(with_states)
-    found[0, 0] = found[0, 0]._replace(status=int(Status.nonfinite))
-    found[0, 1] = found[0, 1]._replace(state=random_state(3))
-    assert first_of_points(found)[0].side == 10.0
-    found[0, 1] = found[0, 1]._replace(status=int(Status.infeasible))
-    assert set(first_of_points(found)) == {1}
+    replicas = dict(with_states)
+    replicas[0, 0] = replicas[0, 0]._replace(status=int(Status.nonfinite))
+    replicas[0, 1] = replicas[0, 1]._replace(state=random_state(3))
+    assert first_of_points(replicas)[0].side == 10.0
+    replicas[0, 1] = replicas[0, 1]._replace(status=int(Status.infeasible))
+    assert set(first_of_points(replicas)) == {1}
 
 
 def kept(settings: MapSettings) -> dict[Key, Replica]:
@@ -68,9 +72,9 @@ def kept(settings: MapSettings) -> dict[Key, Replica]:
     grains.
     """
     rng = np.random.default_rng(0)
-    found = {(point, 0): random_state(point, 20 + point) for point in (0, 1, 3)}
+    states = {(point, 0): random_state(point, 20 + point) for point in (0, 1, 3)}
     return {
-        (p, s): random_replica(rng, settings)._replace(state=found.get((p, s)))
+        (p, s): random_replica(rng, settings)._replace(state=states.get((p, s)))
         for p in range(4)
         for s in (0, 1)
     }
@@ -83,12 +87,13 @@ def test_a_file_has_the_state_of_each_point(tmp_path: Path) -> None:
     data = open_map(tmp_path / "map.nc")
     assert data["states"].positions.dims == ("packing_fraction", "restitution", "grain", "axis_a")
     assert all(
-        one.attrs["long_name"] and one.attrs["units"] for one in data["states"].data_vars.values()
+        variable.attrs["long_name"] and variable.attrs["units"]
+        for variable in data["states"].data_vars.values()
     )
-    found, expected = states_of(data["states"].to_dataset(), 4), first_of_points(written)
-    assert set(found) == set(expected) == {0, 1, 3}
+    read, expected = states_of(data["states"].to_dataset(), 4), first_of_points(written)
+    assert set(read) == set(expected) == {0, 1, 3}
     for point, state in expected.items():
-        jax.tree.map(np.testing.assert_array_equal, found[point], state)
+        jax.tree.map(np.testing.assert_array_equal, read[point], state)
     assert MapSettings(**from_attrs(data)) == settings
     assert "states" not in map_dataset(replace(settings, snapshots=False), written, {}).children
 

@@ -81,24 +81,24 @@ def test_the_series_is_the_theory(alpha: float, nu: float) -> None:
 @settings(max_examples=20, deadline=None)
 @given(ALPHAS, NUS)
 def test_error_is_theory_over_measured_and_intervals_are_positive(alpha: float, nu: float) -> None:
-    found = jg.validity(alpha, nu)
-    for name, error in found.error.items():
-        theory = found.theory[name.removeprefix("local_")]
-        assert 1 + error == pytest.approx(theory / found.measured[name])
-    assert found.theory["dissipation_rate"] == found.theory["shear_stress"]
+    answer = jg.validity(alpha, nu)
+    for name, error in answer.error.items():
+        theory = answer.theory[name.removeprefix("local_")]
+        assert 1 + error == pytest.approx(theory / answer.measured[name])
+    assert answer.theory["dissipation_rate"] == answer.theory["shear_stress"]
     assert all(
         np.all(x > 0)
-        for x in jax.tree.leaves((found.measured_ci95, found.error_ci95, found.factors_ci95))
+        for x in jax.tree.leaves((answer.measured_ci95, answer.error_ci95, answer.factors_ci95))
     )
 
 
 def test_the_table_is_met_at_its_points_within_their_intervals() -> None:
     table = shipped_table()
     flows = table.columns["restitution"], table.columns["packing_fraction"]
-    found = jg.validity(*flows)
+    answer = jg.validity(*flows)
     for name in (*MEASURED, "force_ratio"):
-        apart = np.abs(found.measured[name] - table.columns[name])
-        own = np.hypot(found.measured_ci95[name], 1.96 * table.columns[f"{name}_stderr"])
+        apart = np.abs(answer.measured[name] - table.columns[name])
+        own = np.hypot(answer.measured_ci95[name], 1.96 * table.columns[f"{name}_stderr"])
         assert np.mean(apart < own) > 0.95
 
 
@@ -120,14 +120,14 @@ def test_every_average_of_the_table_has_its_error() -> None:
 
 def test_arrays_broadcast_and_jit_vmap_give_the_same_numbers() -> None:
     alphas, nus = np.array([0.2, 0.5, 0.9]), np.array([[0.3], [0.7]])
-    found = jg.validity(alphas, nus)
-    assert found.measured["pressure"].shape == found.verdict().shape == (2, 3)
+    answer = jg.validity(alphas, nus)
+    assert answer.measured["pressure"].shape == answer.verdict().shape == (2, 3)
     compiled = jax.jit(jg.validity)(alphas, nus)
     mapped = jax.vmap(
         lambda nu: jax.vmap(lambda alpha: jg.validity(alpha, nu))(jnp.asarray(alphas))
     )(jnp.asarray(nus[:, 0]))
-    for one in (compiled, mapped):
-        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(one), strict=True):
+    for by_jax in (compiled, mapped):
+        for a, b in zip(jax.tree.leaves(answer), jax.tree.leaves(by_jax), strict=True):
             # a variance is the difference of two numbers of order 500, and those of factors are of
             # order 1e-8
             np.testing.assert_allclose(np.broadcast_to(a, (2, 3)), b, rtol=VARIANCE_ROUNDING)
@@ -142,7 +142,7 @@ def test_gradients_are_those_of_finite_differences(name: str) -> None:
 
     at, step = jnp.array([0.45, 0.71]), 1e-4
     exact = jax.grad(of)(at)
-    by_steps = [(of(at + step * one) - of(at - step * one)) / (2 * step) for one in np.eye(2)]
+    by_steps = [(of(at + step * axis) - of(at - step * axis)) / (2 * step) for axis in np.eye(2)]
     np.testing.assert_allclose(
         exact, by_steps, rtol=1e-5
     )  # truncation of step² over the range of the map squared
@@ -186,7 +186,7 @@ def made(
 
 
 @pytest.mark.parametrize(
-    ("found", "said"),
+    ("answer", "said"),
     [
         (
             made(-0.05, 0.02, chaos=0.8, pairs=1.1),
@@ -226,9 +226,9 @@ def made(
     ],
 )
 def test_a_verdict_says_error_cause_and_share_of_binary_collisions(
-    found: Validity, said: tuple[str, ...]
+    answer: Validity, said: tuple[str, ...]
 ) -> None:
-    assert all(words in found.verdict() for words in said)
+    assert all(words in answer.verdict() for words in said)
 
 
 def test_the_command_prints_the_numbers_of_python_without_loading_jax(tmp_path: Path) -> None:
@@ -242,11 +242,11 @@ def test_the_command_prints_the_numbers_of_python_without_loading_jax(tmp_path: 
         [sys.executable, "-c", command], capture_output=True, text=True, cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
-    printed, found = json.loads(done.stdout), jg.validity(0.7, 0.6)
-    assert printed["verdict"]["value"] == found.verdict()
+    printed, answer = json.loads(done.stdout), jg.validity(0.7, 0.6)
+    assert printed["verdict"]["value"] == answer.verdict()
     for name in MEASURED:
-        assert printed[name]["value"] == pytest.approx(float(found.measured[name]))
-        ci95 = float(found.measured_ci95[name])
+        assert printed[name]["value"] == pytest.approx(float(answer.measured[name]))
+        ci95 = float(answer.measured_ci95[name])
         assert printed[name]["ci95"] == pytest.approx(ci95, rel=VARIANCE_ROUNDING)
 
 
@@ -292,11 +292,11 @@ def test_intervals_hold_on_fresh_flows_as_often_as_they_say(result: dict) -> Non
     error of it.
     """
     fresh = json.loads((RESULTS / "reference_runs.json").read_text(encoding="utf-8"))["rows"]
-    found = reference.coverage(list(reference.judged(shipped_table(), fresh)))
-    for name, one in result["coverage"].items():
-        assert one == pytest.approx(found[name], abs=2e-3)
+    coverage = reference.coverage(list(reference.judged(shipped_table(), fresh)))
+    for name, committed in result["coverage"].items():
+        assert committed == pytest.approx(coverage[name], abs=2e-3)
         for kind in ("covered", "covered_narrow"):
-            within = round(found[name][kind] * len(fresh))
+            within = round(coverage[name][kind] * len(fresh))
             as_few = sum(comb(40, k) * 0.95**k * 0.05 ** (40 - k) for k in range(within + 1))
             assert len(fresh) == 40
             assert as_few > 0.025
