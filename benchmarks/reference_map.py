@@ -10,7 +10,7 @@ few for long waves, maps of more take the place of the plane's: 6400 from ν = 0
 several sizes say how averages approach those of a large system (``python -m benchmarks
 size_limits``), and a map at dt = 1e-3 what becomes of the force ratio.
 
-    python -m benchmarks reference_map               # two hours on two cores
+    python -m benchmarks reference_map --first-seed 2  # the committed seeds, two hours on two cores
     python -m benchmarks reference_map --seeds 4     # two seeds more
     python -m benchmarks reference_map --part between  # ν = 0.72 to 0.77, 6400 grains, an hour
     python -m benchmarks reference_map --part dissipative --seeds 1  # 16,000, an hour and a half
@@ -175,7 +175,9 @@ SEVERAL_SEEDS = {"plane": plane, "between": between, "dissipative": dissipative}
 PARTS = {"sizes": sizes, "large": large, "check": check, "coarse": coarse}
 
 
-def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT) -> None:
+def run(
+    output: Output, seeds: int = 2, first_seed: int = 0, part: str = "plane", folder: Path = KEPT
+) -> None:
     """Map what is missing of a part, and write it; all seeds of ``PLANE`` as one map."""
     folder = folder.with_name(f"{folder.name}_quick") if output.quick else folder
     folder.mkdir(parents=True, exist_ok=True)
@@ -193,9 +195,14 @@ def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT
     if part in SEVERAL_SEEDS:
         settings = SEVERAL_SEEDS[part](output.quick)
         merged = jg.merge_maps(
-            [made(f"{part}_{k}", **settings, first_seed=k) for k in range(seeds)]
+            [
+                made(f"{part}_{k}", **settings, first_seed=k)
+                for k in range(first_seed, first_seed + seeds)
+            ]
         )
-        merged.attrs["command"] = command
+        merged.attrs["command"] = (
+            f"{command} --part {part} --seeds {seeds} --first-seed {first_seed}"
+        )
         write_dataset(merged, output.path("reference", ".nc" if part == "plane" else f"_{part}.nc"))
         return
     for name, chosen in PARTS[part](output.quick).items():

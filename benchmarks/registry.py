@@ -94,6 +94,7 @@ BENCHMARKS = (
         ),
         (
             Option("--seeds", "number of seeds, those that are kept included", int),
+            Option("--first-seed", "the first of the seeds", int),
             Option(
                 "--part",
                 "the plane, flows between loose and dense ones, dissipative ones of more grains, "

@@ -162,7 +162,7 @@ def _entries(flow: Validity) -> dict[str, Entry]:
         "verdict": Entry(flow.verdict(), "what kinetic theory can predict, in words", None),
         "restitution": Entry(flow.restitution, "coefficient of restitution"),
         "packing_fraction": Entry(flow.packing_fraction, "packing fraction"),
-        "fails_first": Entry(flow.fails_first(), "assumption that is furthest off", None),
+        "fails_first": Entry(flow.fails_first(), "assumption that is violated most", None),
     }
     of_theory = "kinetic theory over measured average, less one"
     groups = (
