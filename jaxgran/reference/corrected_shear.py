@@ -61,12 +61,12 @@ class CorrelationLaws:
 
 
 MEASURED_LAWS = CorrelationLaws(
-    length=np.array([0.2246, 0.02506, 1.454]),
-    length_stderr=np.array([0.007508, 0.003236, 0.02956]),
-    pairs=np.array([0.3778, 0.01607, 1.608]),
-    pairs_stderr=np.array([0.02372, 0.0008302, 0.0142]),
+    length=np.array([0.2242, 0.0255, 1.447]),
+    length_stderr=np.array([0.007551, 0.003304, 0.02963]),
+    pairs=np.array([0.3792, 0.01599, 1.611]),
+    pairs_stderr=np.array([0.02335, 0.0008127, 0.01397]),
     jamming_fraction=np.array(0.8386),
-    scatter=np.array([0.1262, 0.1575, 0.1493]),
+    scatter=np.array([0.1263, 0.1575, 0.1492]),
     restitution_range=np.array([0.1, 0.95]),
     packing_fraction_range=np.array([0.1, 0.82]),
     fitted_to="294 flows of N = 1600 to 16000, dt = 1e-4",
