@@ -249,8 +249,8 @@ def checks() -> Iterator[dict[str, Any]]:
 
 
 def compared(small: xr.Dataset, large: xr.Dataset) -> Iterator[dict[str, Any]]:
-    """How flows agree with the same ones of more grains, for each average and smaller N: root mean
-    squares as they are, corrected, and of sampling; the half-width (rms) of the 95 % interval, and
+    """How flows agree with the same ones of more grains, for each average and smaller N: the mean
+    difference, and root mean squares as they are, corrected, and of sampling; the half-width (rms) of the 95 % interval, and
     the share of flows within. Both corrections follow from one law, so the difference of their
     errors counts; the excess of a force ratio has no law of its own, so that of the smaller flow
     counts in full.
@@ -273,6 +273,7 @@ def compared(small: xr.Dataset, large: xr.Dataset) -> Iterator[dict[str, Any]]:
             "average": name,
             "grains": grains,
             "flows": apart.size,
+            "mean": float(apart.mean()),
             **{words: float(np.sqrt((x**2).mean())) for words, x in rms.items()},
             "in_standard_errors": float(np.sqrt(((apart / rms["sampling"]) ** 2).mean())),
             "within": float((abs(apart) < half).mean()),
