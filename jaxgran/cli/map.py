@@ -190,6 +190,8 @@ def _print_success_of_theory(data) -> None:
     from jaxgran.maps.schema import flattened
 
     flat = flattened(data)
+    if "theory/pressure" not in flat:
+        return
     error = (flat["theory/pressure"] / flat.pressure_large_system - 1).values
     if known := np.isfinite(error).sum():
         right = (abs(error) <= 0.1).sum()
