@@ -212,23 +212,24 @@ def draw(rows: list[dict]) -> Figure:
     figure = Figure(figsize=(TWO_COLUMNS, 4.6), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, sharey="row")
     for column, discs in enumerate(RESTITUTIONS):
-        for k, one in enumerate(row for row in rows if row["discs"] == discs):
-            collapses = one["restitution"] < THRESHOLDS[discs]
+        rows_of_discs = [row for row in rows if row["discs"] == discs]
+        for k, row in enumerate(rows_of_discs):
+            collapses = row["restitution"] < THRESHOLDS[discs]
             style = {
                 "color": ("black", "tab:blue", "tab:red")[k % 3],
                 "marker": "osD"[k % 3],
                 "markersize": 3.5,
                 "markerfacecolor": None if collapses else "white",
                 "linestyle": "none" if collapses else ":",
-                "label": rf"$\alpha={one['restitution']:g}$",
+                "label": rf"$\alpha={row['restitution']:g}$",
             }
-            steps, excess = np.array(one["steps"]), np.array(one["excess"])
+            steps, excess = np.array(row["steps"]), np.array(row["excess"])
             drawn = excess > LEAST
-            panels[0, column].errorbar(TIMESTEPS, steps, one["steps_error"], **style)
-            error = np.minimum(one["excess_error"], 0.9 * excess)[drawn]
+            panels[0, column].errorbar(TIMESTEPS, steps, row["steps_error"], **style)
+            error = np.minimum(row["excess_error"], 0.9 * excess)[drawn]
             panels[1, column].errorbar(TIMESTEPS[drawn], excess[drawn], error, **style)
             if collapses:
-                exact = roots(discs, one["restitution"])
+                exact = roots(discs, row["restitution"])
                 decades = np.log10(TIMESTEPS / TIMESTEPS[MIDDLE])
                 lines = (
                     steps[MIDDLE] - exact.steps_per_decade * decades,

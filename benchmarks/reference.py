@@ -156,7 +156,7 @@ def make_table(
         "map commit": data.attrs["commit"],
         **made_from,
         **{
-            f"share of the plane with the pressure of {name} within 10 %": f"{x:.3f}"
+            f"share of the points, by area, with the pressure of {name} within 10 %": f"{x:.3f}"
             for name, x in within.items()
         },
     }

@@ -11,7 +11,7 @@ several sizes say how averages approach those of a large system (``python -m ben
 size_limits``), and a map at dt = 1e-3 what becomes of the force ratio.
 
     python -m benchmarks reference_map --first-seed 2  # the committed seeds, two hours on two cores
-    python -m benchmarks reference_map --seeds 4     # two seeds more
+    python -m benchmarks reference_map --first-seed 2 --seeds 4  # two more
     python -m benchmarks reference_map --part between  # ν = 0.72 to 0.77, 6400 grains, an hour
     python -m benchmarks reference_map --part dissipative --seeds 1  # 16,000, an hour and a half
     python -m benchmarks reference_map --part sizes  # flows of several sizes

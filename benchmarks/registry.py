@@ -93,8 +93,12 @@ BENCHMARKS = (
             ),
         ),
         (
-            Option("--seeds", "number of seeds, those that are kept included", int),
-            Option("--first-seed", "the first of the seeds", int),
+            Option(
+                "--seeds",
+                "number of seeds of the first three parts, those that are kept included",
+                int,
+            ),
+            Option("--first-seed", "the first of these seeds", int),
             Option(
                 "--part",
                 "the plane, flows between loose and dense ones, dissipative ones of more grains, "

@@ -113,8 +113,10 @@ def one_seed(flow: jg.ShearFlow, before: float, strain: float, seed: int) -> dic
     sums = {
         f"tally_{name}": np.stack([getattr(block, name) for block in tallies]) for name in TABLE
     }
-    shapes = {name: np.stack([block[name] for block in structures]) for name in structures[0]}
-    return {"area": np.asarray(state.side) ** 2, **sums, **shapes}
+    structure_of_blocks = {
+        name: np.stack([block[name] for block in structures]) for name in structures[0]
+    }
+    return {"area": np.asarray(state.side) ** 2, **sums, **structure_of_blocks}
 
 
 def structure(state: jg.State) -> dict[str, np.ndarray]:

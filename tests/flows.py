@@ -153,10 +153,10 @@ def packed():
 
     @cache
     def packing(packing_fraction: float, seed: int = 0) -> State:
-        state, packed_below = compiled(
+        state, is_packed = compiled(
             ShearFlow(GRAINS, 0.5, packing_fraction, 1e-3), jax.random.key(seed)
         )
-        assert packed_below
+        assert is_packed
         return state
 
     return packing

@@ -192,8 +192,8 @@ def made(
             made(-0.05, 0.02, chaos=0.8, pairs=1.1),
             (
                 "pressure by 5.0 ± 2.0 % and the local temperature by 10.0 ± 3.0 %. The",
-                "are independent: by itself it makes Enskog's contact pressure 25 % too high",
-                "all together leave it 14 % too high at the",  # 1/(0.8 × 1.1)
+                "are independent: alone it makes Enskog's contact pressure 25 % too high",
+                "all together make it 14 % too high at the",  # 1/(0.8 × 1.1)
                 "binary (force ratio at most 1.001, dt",
             ),
         ),
@@ -201,7 +201,7 @@ def made(
             made(0.2, 0.02, pairs=0.7),
             (
                 "overestimates the pressure by 20.0 ± 2.0 % and underestimates the local",
-                "those of equilibrium: by itself it makes Enskog's contact pressure 43 % too high",
+                "as in equilibrium: alone it makes Enskog's contact pressure 43 % too high",
             ),
         ),
         (
@@ -215,13 +215,13 @@ def made(
             made(0.01, 0.02, of_temperature=0.1),
             (
                 "and overestimates the local temperature by",
-                "Each of its assumptions holds within 2 %; all together leave Enskog's",
+                "Each of its assumptions holds within 2 %; all together make Enskog's",
                 "pressure right at",
             ),
         ),
         (
             made(-0.9, 0.02, 4.0, binary=8.0, pairs=5.0),
-            ("that collisions are binary: by", "explain 25 % of the mean contact force"),
+            ("that collisions are binary: alone", "explain 25 % of the mean contact force"),
         ),
     ],
 )

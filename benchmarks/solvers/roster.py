@@ -97,10 +97,10 @@ def package_solvers() -> dict[str, Solver]:
 
 def versions() -> dict[str, str]:
     """Versions of the packages that are installed."""
-    numbers = {}
+    installed = {}
     for name in PACKAGES:
         try:
-            numbers[name] = version(name)
+            installed[name] = version(name)
         except PackageNotFoundError:
             continue
-    return numbers
+    return installed

@@ -130,7 +130,9 @@ def print_tables(data) -> None:
 
     for part in parts(data):
         if np.isfinite(part.force_ratio).any():
-            size = f"N = {part.attrs['grains']}" if "grains" in part.coords else "N of each point"
+            size = (
+                f"N = {part.attrs['grains']}" if "grains" in part.coords else "the N of each point"
+            )
             title = (
                 f"Force ratio by packing fraction ν and restitution α: {size}, dt = "
                 f"{part.attrs['timestep']:g}/γ̇, {part.attrs['activation']} activation"
@@ -195,4 +197,5 @@ def _print_success_of_theory(data) -> None:
     error = (flat["theory/pressure"] / flat.pressure_large_system - 1).values
     if known := np.isfinite(error).sum():
         right = (abs(error) <= 0.1).sum()
-        print_text(f"Kinetic theory is within 10 % of this pressure at {right} of {known} points.")
+        words = "Kinetic theory is within 10 % of the pressure of a large system at"
+        print_text(f"{words} {right} of {known} points.")

@@ -122,7 +122,7 @@ def _print_plane(flow: Validity, factors: bool, corrected: bool) -> None:
         factor_rows.append([*pair, *_factors(point, in_brackets)])
     about = "In brackets: 95 % half-width of the last digits"
     names = ("error in %", "if corrected")[: 1 + corrected]
-    columns = ("α", "ν", "force ratio", "pressure", *names, "fails first")
+    columns = ("α", "ν", "force ratio", "pressure", *names, "violated most")
     print_table(f"Error of kinetic theory in the pressure. {about}.", columns, rows)
     if factors:
         names = (name.replace("_", " ") for name in ASSUMPTIONS)

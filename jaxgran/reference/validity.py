@@ -28,10 +28,10 @@ COLUMNS = ("average", "measured", "theory", "error", "error if corrected")
 """What ``Validity.rows`` gives of every average."""
 
 ASSUMPTIONS = {
-    "local_temperature": "the granular temperature is that of neighbours",
+    "local_temperature": "the granular temperature equals the local one",
     "anisotropy": "velocities are isotropic",
     "chaos": "velocities of colliding grains are independent",
-    "pairs": "pairs at contact are those of equilibrium",
+    "pairs": "as many pairs are at contact as in equilibrium",
     "binary": "collisions are binary",
 }
 """What the theory assumes, by the name of its factor."""
@@ -153,12 +153,16 @@ class Validity(NamedTuple):
             f"{'' if same else of_temperature[0] + ' '}the local temperature{of_temperature[1]}"
         )
         first = self.fails_first()
-        cause = (
-            "Each of its assumptions holds within 2 %; all together leave Enskog's contact pressure"
-            if first == "none"
-            else f"The assumption that is violated most is that {ASSUMPTIONS[first]}: by itself it "
-            f"makes Enskog's contact pressure {_too(self.factors[first])}; all together leave it"
-        )
+        pressure_of_enskog = "Enskog's contact pressure"
+        if first == "none":
+            cause = (
+                f"Each of its assumptions holds within 2 %; all together make {pressure_of_enskog}"
+            )
+        else:
+            cause = (
+                f"The assumption that is violated most is that {ASSUMPTIONS[first]}: alone it makes "
+                f"{pressure_of_enskog} {_deviation(self.factors[first])}; all together make it"
+            )
         ratio, ratio_ci95 = (float(x["force_ratio"]) for x in (self.measured, self.measured_ci95))
         off = max(ratio - 1, 0.0) + ratio_ci95
         step = f"dt = {shipped_table().timestep}/γ̇"
@@ -168,7 +172,8 @@ class Validity(NamedTuple):
         else:
             explained = f"{100 / ratio:.2g} % of the mean contact force"
             binary = f"Binary collisions explain {explained} ({step})"
-        return f"{start}. {cause} {_too(self.over_enskog())} at the measured temperature. {binary}."
+        joint = f"{_deviation(self.over_enskog())} at the measured temperature"
+        return f"{start}. {cause} {joint}; the rest is the error of the temperature. {binary}."
 
     def _departure(self, name: str) -> tuple[str, str]:
         """What the theory does with an average: a verb, and by how much."""
@@ -179,7 +184,7 @@ class Validity(NamedTuple):
         return f"{side}estimates", f" by {with_error(abs(error), ci95)} %"
 
 
-def _too(factor: Any) -> str:
+def _deviation(factor: Any) -> str:
     """By how much a pressure is off that has to be multiplied by a factor to be right."""
     percent = 100 * (1 / float(factor) - 1)
     if abs(percent) < 0.5:
