@@ -153,15 +153,13 @@ class Validity(NamedTuple):
             f"{'' if same else of_temperature[0] + ' '}the local temperature{of_temperature[1]}"
         )
         first = self.fails_first()
-        pressure_of_enskog = "Enskog's contact pressure"
+        enskog = "Enskog's contact pressure"
         if first == "none":
-            cause = (
-                f"Each of its assumptions holds within 2 %; all together make {pressure_of_enskog}"
-            )
+            cause = f"Each of its assumptions holds within 2 %; all together make {enskog}"
         else:
             cause = (
                 f"The assumption that is violated most is that {ASSUMPTIONS[first]}: alone it makes "
-                f"{pressure_of_enskog} {_deviation(self.factors[first])}; all together make it"
+                f"{enskog} {_deviation(self.factors[first])}; all together make it"
             )
         ratio, ratio_ci95 = (float(x["force_ratio"]) for x in (self.measured, self.measured_ci95))
         off = max(ratio - 1, 0.0) + ratio_ci95
