@@ -158,8 +158,8 @@ class Validity(NamedTuple):
             cause = f"Each of its assumptions holds within 2 %; all together make {enskog}"
         else:
             cause = (
-                f"The assumption that is violated most is that {ASSUMPTIONS[first]}: alone it makes "
-                f"{enskog} {_deviation(self.factors[first])}; all together make it"
+                f"The assumption that is violated most is that {ASSUMPTIONS[first]}: alone it "
+                f"makes {enskog} {_deviation(self.factors[first])}; all together make it"
             )
         ratio, ratio_ci95 = (float(x["force_ratio"]) for x in (self.measured, self.measured_ci95))
         off = max(ratio - 1, 0.0) + ratio_ci95
