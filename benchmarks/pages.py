@@ -147,7 +147,7 @@ def shear_stress_ratio_at(
 ) -> tuple[float, float]:
     """Contact shear stress over the binary one at a point of a map, and its standard error."""
     chosen = {"restitution": restitution, "packing_fraction": packing_fraction}
-    value, error = (float(number.sel(chosen)) for number in shear_stress_ratio(_map(file)))
+    value, error = (float(values.sel(chosen)) for values in shear_stress_ratio(_map(file)))
     return value, error
 
 

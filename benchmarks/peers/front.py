@@ -40,9 +40,9 @@ def equal_work(flow: dict, curve: str) -> tuple[Choice, Choice] | None:
     if theirs is None:
         return None
     depth = theirs.row["largest_overlap"]
-    ours = rows_of(flow, "jaxgran")
-    our_row = cheapest([row for row in ours if row["largest_overlap"] <= depth] or ours[-1:])
-    return None if our_row is None else (our_row, theirs)
+    rows = rows_of(flow, "jaxgran")
+    ours = cheapest([row for row in rows if row["largest_overlap"] <= depth] or rows[-1:])
+    return None if ours is None else (ours, theirs)
 
 
 def ratio(flow: dict, curve: str) -> str:

@@ -24,7 +24,7 @@ from jaxgran.cli.terminal import (
 )
 from jaxgran.maps.interruption import Interrupted, is_interruption
 from jaxgran.maps.settings import OPTIONS
-from jaxgran.model.display import with_error
+from jaxgran.model.display import to_two_digits, with_error
 
 _PRINTED = {
     "force_ratio": "force ratio",
@@ -265,7 +265,7 @@ def _percent(part) -> str:
     if known.size == 0:
         return ""
     largest = known.flat[np.argmax(abs(known))]
-    median, largest = (f"{float(f'{100 * x:.2g}'):g}" for x in (np.median(known), largest))
+    median, largest = (to_two_digits(100 * x) for x in (np.median(known), largest))
     return median if part.size == 1 else f"{median} ({largest})"
 
 

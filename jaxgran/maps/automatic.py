@@ -22,6 +22,7 @@ from jaxgran.maps.settings_checks import (
 )
 from jaxgran.model.checks import InputError, refused, two_digits
 from jaxgran.model.choices import HALF_INTERVAL, MAX_GRAINS, MAX_REPLICAS
+from jaxgran.model.display import to_two_digits
 from jaxgran.model.flow import ShearFlow
 from jaxgran.reference.surface import coordinates
 from jaxgran.reference.table import CORRECTED, THEORY, shipped_table
@@ -250,16 +251,14 @@ def _plan(settings: MapSettings, error: float) -> Plan:
 def _range(numbers: np.ndarray) -> str:
     """The least and the largest number, with two digits unless they are whole."""
     exact = numbers.dtype.kind == "i"
-    ends = sorted({*map(str if exact else _rounded, (numbers.min(), numbers.max()))}, key=float)
+    ends = sorted(
+        {*map(str if exact else to_two_digits, (numbers.min(), numbers.max()))}, key=float
+    )
     return " to ".join(ends)
 
 
 def _time(seconds: float) -> str:
     return f"about {duration(seconds)}" if seconds > 10 else "a few seconds"
-
-
-def _rounded(number: float) -> str:
-    return f"{float(f'{number:.2g}'):g}"
 
 
 def _timestep_for(settings: MapSettings, error: float, strain: Any) -> tuple[float, str]:

@@ -111,6 +111,11 @@ def rounded(value: Any) -> Any:
     return float(f"{float(value):.6g}") if np.ndim(value) == 0 else value
 
 
+def to_two_digits(value: float) -> str:
+    """A number to two digits, without an exponent where it is short: 0.037, 5.6, 120."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
 def are_numbers(*leaves: Any) -> bool:
     """Whether all leaves are numeric, and none is traced."""
     return all(_numbers(leaf) is not None for leaf in leaves)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.model.display import text_of, with_error
+from jaxgran.model.display import text_of, to_two_digits, with_error
 from jaxgran.reference.evaluation import estimates, over_range
 from jaxgran.reference.table import (
     CORRECTED,
@@ -187,7 +187,7 @@ def _deviation(factor: Any) -> str:
     percent = 100 * (1 / float(factor) - 1)
     if abs(percent) < 0.5:
         return "right"
-    return f"{float(f'{abs(percent):.2g}'):g} % too {'high' if percent > 0 else 'low'}"
+    return f"{to_two_digits(abs(percent))} % too {'high' if percent > 0 else 'low'}"
 
 
 def validity(restitution: Any, packing_fraction: Any) -> Validity:
