@@ -220,12 +220,9 @@ BENCHMARKS = (
     Benchmark(
         "size_study",
         "What does the number of grains do to stresses, temperature and force ratio?",
-        (200, 1),
+        (60, 1),
         ("size_study.json", "size_study.png", "size_study_waves.png"),
-        (
-            Option("--largest", "leaves out flows of more grains", int),
-            Option("--folder", "where the flows that are done are kept", Path),
-        ),
+        (Option("--folder", "where the flows that are done are kept", Path),),
     ),
     Benchmark(
         "size_limits",

@@ -1,5 +1,5 @@
 """What the number of grains does to stresses, temperature and force ratio, from 64 grains to
-100,000.
+25,600.
 
 Twelve flows at dt = 1e-3 / shear rate, midpoint rule. For each the study measures, against N:
 stresses, granular temperature, local granular temperature, force ratio and collision rate, with
@@ -11,9 +11,8 @@ Before its sample a flow is sheared over ``PREPARED`` memories, and the sample l
 memories. The memory is max(nT/τ, 0.35 L √(ρ/p)), with the values of the next smaller N. Every flow
 that is done is kept in a folder, so a study that was stopped goes on where it was.
 
-    python -m benchmarks size_study                   # 3 hours on two cores
-    python -m benchmarks size_study --largest 25600   # an hour
-    python -m benchmarks size_study --quick           # two flows of 64 and 256 grains, a minute
+    python -m benchmarks size_study          # an hour on two cores
+    python -m benchmarks size_study --quick  # two flows of 64 and 256 grains, a minute
 """
 
 import multiprocessing
@@ -55,20 +54,20 @@ class Plan(NamedTuple):
 
 FULL = Plan(
     (
-        (0.1, 0.3, 100_000),
-        (0.2, 0.2, 100_000),
-        (0.2, 0.6, 100_000),
-        (0.5, 0.6, 100_000),
-        (0.8, 0.2, 100_000),
-        (0.8, 0.6, 100_000),
-        (0.95, 0.1, 100_000),
-        (0.95, 0.6, 100_000),
+        (0.1, 0.3, 25_600),
+        (0.2, 0.2, 25_600),
+        (0.2, 0.6, 25_600),
+        (0.5, 0.6, 25_600),
+        (0.8, 0.2, 25_600),
+        (0.8, 0.6, 25_600),
+        (0.95, 0.1, 25_600),
+        (0.95, 0.6, 25_600),
         (0.2, 0.8, 6400),
         (0.8, 0.82, 6400),
         (0.2, 0.75, 6400),
         (0.5, 0.75, 6400),
     ),
-    {64: 16, 100: 16, 400: 8, 1600: 4, 6400: 2, 25600: 1, 100_000: 1},
+    {64: 16, 100: 16, 400: 8, 1600: 4, 6400: 2, 25_600: 1},
 )
 QUICK = Plan(((0.5, 0.6, 256), (0.8, 0.2, 256)), {64: 2, 256: 1})
 
@@ -240,12 +239,9 @@ def sample_of(row: dict[str, np.ndarray], grains: int) -> Sample:
     return Sample(tally, row["area"], np.ones(len(row["area"])), grains)
 
 
-def measure(plan: Plan, folder: Path, largest: int) -> None:
+def measure(plan: Plan, folder: Path) -> None:
     """Measure all flows that are not yet done, the smaller N of a flow first, on all cores."""
-    sizes = {
-        k: [n for n in plan.seeds if n <= min(most, largest)]
-        for k, (_, _, most) in enumerate(plan.flows)
-    }
+    sizes = {k: [n for n in plan.seeds if n <= most] for k, (_, _, most) in enumerate(plan.flows)}
     left = {
         k: [n for n in ns if not kept_file(folder, *plan.flows[k][:2], n).exists()]
         for k, ns in sizes.items()
@@ -377,19 +373,14 @@ def spectrum(row: dict[str, np.ndarray], grains: int) -> dict[str, list[float]]:
     return {name: rounded(values.tolist(), 4) for name, values in series.items()}
 
 
-def run(output: Output, largest: int = 100_000, folder: Path = KEPT) -> None:
+def run(output: Output, folder: Path = KEPT) -> None:
     """Measure what is not yet done, and write ``size_study`` as JSON, and figures of values and
     waves.
     """
     plan = QUICK if output.quick else FULL
     folder = folder.with_name(f"{folder.name}_quick") if output.quick else folder
-    measure(plan, folder, largest)
-    done = [
-        (k, n)
-        for k, (alpha, nu, most) in enumerate(plan.flows)
-        for n in plan.seeds
-        if n <= most and kept_file(folder, alpha, nu, n).exists()
-    ]
+    measure(plan, folder)
+    done = [(k, n) for k, (_, _, most) in enumerate(plan.flows) for n in plan.seeds if n <= most]
     rows = [result(plan, k, n, folder) for k, n in done]
     for (k, n), row in zip(done, rows, strict=True):
         if n == dict(done)[k]:  # the last one of a flow is its largest
