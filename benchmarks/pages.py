@@ -33,6 +33,7 @@ from jaxgran.model.display import with_error
 from jaxgran.plotting.factors import CURVES, PREFIX, with_temperature
 from jaxgran.reference.table import FACTORS
 from jaxgran.reference.validity import validity
+from jaxgran.sampling.budget import SIZE_LAWS
 
 BUILD = ROOT / "docs" / "_build"
 TEMPLATES = {  # of committed pages
@@ -240,7 +241,7 @@ ENVIRONMENT.filters |= {
     "date": lambda number: f"{number // 10000}-{number // 100 % 100:02d}-{number % 100:02d}",
 }
 ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table}
-ENVIRONMENT.globals |= {"SOLVER_GROUPS": GROUPS, "FACTOR_CURVES": CURVES}
+ENVIRONMENT.globals |= {"SOLVER_GROUPS": GROUPS, "FACTOR_CURVES": CURVES, "SIZE_LAWS": SIZE_LAWS}
 ENVIRONMENT.globals |= {
     function.__name__: function
     for function in (

@@ -12,11 +12,10 @@ size_limits``), and a map at dt = 1e-3 what becomes of the force ratio.
 
     python -m benchmarks reference_map --first-seed 2  # the committed seeds, two hours on two cores
     python -m benchmarks reference_map --first-seed 2 --seeds 4  # two more
-    python -m benchmarks reference_map --part between  # ν = 0.72 to 0.77, 6400 grains, an hour
+    python -m benchmarks reference_map --first-seed 2 --part between  # 6400 grains, an hour
     python -m benchmarks reference_map --part dissipative --seeds 1  # 16,000, an hour and a half
-    python -m benchmarks reference_map --part sizes  # flows of several sizes
-    python -m benchmarks reference_map --part large  # one flow of 102,400 grains, half an hour
-    python -m benchmarks reference_map --part check  # flows that no law was fitted to, 20 minutes
+    python -m benchmarks reference_map --part sizes  # flows of several sizes, 20 minutes
+    python -m benchmarks reference_map --part check  # flows that check their law, 20 minutes
     python -m benchmarks reference_map --part coarse  # dt = 1e-3
     python -m benchmarks reference_map --quick       # 3 × 3 points of 64 and 100 grains, a minute
 """
@@ -131,14 +130,6 @@ def sizes(quick: bool) -> dict[str, dict[str, Any]]:
     }
 
 
-def large(quick: bool) -> dict[str, dict[str, Any]]:
-    """The arguments of ``ratio_map`` for a flow of four times as many grains as those of
-    ``sizes``.
-    """
-    chosen = {"restitution": (0.7,), "packing_fraction": (0.6,), "timestep": 5e-4}
-    return {"large": chosen | {"grains": 512 if quick else 102_400}}
-
-
 def check(quick: bool) -> dict[str, dict[str, Any]]:
     """The arguments of ``ratio_map`` for flows that no law of the size was fitted to, small and
     large.
@@ -172,13 +163,15 @@ def coarse(quick: bool) -> dict[str, dict[str, Any]]:
 
 
 SEVERAL_SEEDS = {"plane": plane, "between": between, "dissipative": dissipative}
-PARTS = {"sizes": sizes, "large": large, "check": check, "coarse": coarse}
+PARTS = {"sizes": sizes, "check": check, "coarse": coarse}
 
 
 def run(
     output: Output, seeds: int = 2, first_seed: int = 0, part: str = "plane", folder: Path = KEPT
 ) -> None:
     """Map what is missing of a part, and write it; all seeds of ``PLANE`` as one map."""
+    if part not in SEVERAL_SEEDS and (seeds, first_seed) != (2, 0):
+        raise SystemExit(f"--seeds and --first-seed belong to {', '.join(SEVERAL_SEEDS)}.")
     folder = folder.with_name(f"{folder.name}_quick") if output.quick else folder
     folder.mkdir(parents=True, exist_ok=True)
     command = "python -m benchmarks reference_map"

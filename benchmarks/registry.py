@@ -87,7 +87,7 @@ BENCHMARKS = (
             *(
                 f"reference_{name}.nc"
                 for name in (
-                    *("between", "dissipative", "sizes_loose", "sizes_dense", "large"),
+                    *("between", "dissipative", "sizes_loose", "sizes_dense"),
                     *("check_small", "check_large", "coarse"),
                 )
             ),
@@ -102,9 +102,8 @@ BENCHMARKS = (
             Option(
                 "--part",
                 "the plane, flows between loose and dense ones, dissipative ones of more grains, "
-                "flows of several sizes, a large one, flows that no law was fitted to, or a "
-                "coarse time step",
-                choices=("plane", "between", "dissipative", "sizes", "large", "check", "coarse"),
+                "flows of several sizes, those that check the law of the size, or a coarse step",
+                choices=("plane", "between", "dissipative", "sizes", "check", "coarse"),
             ),
             Option("--folder", "where the maps that are done are kept", Path),
         ),
@@ -220,7 +219,7 @@ BENCHMARKS = (
     Benchmark(
         "size_study",
         "What does the number of grains do to stresses, temperature and force ratio?",
-        (60, 1),
+        (20, 1),
         ("size_study.json", "size_study.png", "size_study_waves.png"),
         (Option("--folder", "where the flows that are done are kept", Path),),
     ),

@@ -11,7 +11,7 @@ Before its sample a flow is sheared over ``PREPARED`` memories, and the sample l
 memories. The memory is max(nT/τ, 0.35 L √(ρ/p)), with the values of the next smaller N. Every flow
 that is done is kept in a folder, so a study that was stopped goes on where it was.
 
-    python -m benchmarks size_study          # an hour on two cores
+    python -m benchmarks size_study          # 20 minutes on two cores
     python -m benchmarks size_study --quick  # two flows of 64 and 256 grains, a minute
 """
 

@@ -14,7 +14,7 @@ from benchmarks.size_limits import (
 )
 
 GRAINS = (400, 1600, 6400, 25600)
-LAW = (0.45, 0.004, 0.1, 0.8, 0.82)  # s, a, b, m, ν_w
+LAW = (0.45, 0.1, 0.8, 0.82)  # s, b, m, ν_w
 
 
 def study(noise: float, seed: int = 0) -> list[dict]:

@@ -62,9 +62,9 @@ class CorrelationLaws:
 
 MEASURED_LAWS = CorrelationLaws(
     length=np.array([0.2242, 0.0255, 1.447]),
-    length_stderr=np.array([0.007551, 0.003304, 0.02963]),
-    pairs=np.array([0.3792, 0.01599, 1.611]),
-    pairs_stderr=np.array([0.02335, 0.0008127, 0.01397]),
+    length_stderr=np.array([0.00755, 0.003303, 0.02963]),
+    pairs=np.array([0.3794, 0.01597, 1.611]),
+    pairs_stderr=np.array([0.02336, 0.0008123, 0.01398]),
     jamming_fraction=np.array(0.8386),
     scatter=np.array([0.1263, 0.1575, 0.1492]),
     restitution_range=np.array([0.1, 0.95]),
