@@ -226,7 +226,7 @@ BENCHMARKS = (
     Benchmark(
         "size_limits",
         "What are the averages of a large system, and by which law are they approached?",
-        (0.1, 0.1),
+        (0.25, 0.25),
         ("size_limits.json",),
     ),
     Benchmark(

@@ -13,7 +13,7 @@ the reduced χ², as a profile of velocity that lasts longer than a sample is no
 flows. Sixteen flows of 256, 1024 and 25,600 grains were not fitted (``--part check``; the reference
 map has five of them at other N), and neither were those that ``reference`` judges, of 102,400.
 
-    python -m benchmarks size_limits   # a second
+    python -m benchmarks size_limits  # 15 seconds
 """
 
 import json
@@ -31,7 +31,7 @@ from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
 from benchmarks.reference_map import PLANE
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.sampling.budget import LARGE_SYSTEM, SIZE_LAWS, SizeLaw, jamming_error
+from jaxgran.sampling.budget import LARGE_SYSTEM, SIZE_LAWS, SizeLaw
 
 AVERAGES = tuple(SIZE_LAWS)
 SIZES = "reference_sizes_loose.nc", "reference_sizes_dense.nc"
@@ -260,10 +260,10 @@ def within(constants: np.ndarray, flow: Flow, spread: float) -> np.ndarray:
     intervals of both standard errors and of what ``sampling.budget`` adds to the law; what it adds
     at the largest N is common to both.
     """
-    missing, relative = missing_part(constants, flow), flow.stderrs / flow.values
-    apart = np.log(flow.values / flow.values[-1]) - np.log1p(-missing) + np.log1p(-missing[-1])
-    added = np.hypot(
-        spread * missing / (1 - missing), jamming_error(flow.packing_fraction, flow.grains)
+    law, relative = SizeLaw(*constants, spread), flow.stderrs / flow.values
+    missing, added = (
+        x(flow.restitution, flow.packing_fraction, flow.grains) for x in (law.missing, law.error)
     )
+    apart = np.log(flow.values / flow.values[-1]) - np.log1p(-missing) + np.log1p(-missing[-1])
     sampling = HALF_INTERVAL * np.hypot(relative, relative[-1])
     return (abs(apart) < np.hypot(sampling, added - added[-1]))[:-1]

@@ -68,6 +68,14 @@ class SizeLaw(NamedTuple):
         part = waves * np.clip((self.end - nu) / 0.1, 0, 1) * (count / 1600) ** -self.exponent
         return np.minimum(part, _MOST_MISSING)
 
+    def error(
+        self, restitution: ArrayLike, packing_fraction: ArrayLike, grains: ArrayLike
+    ) -> np.ndarray:
+        """``size_error`` by this law."""
+        missing = self.missing(restitution, packing_fraction, grains)
+        waves = self.spread * missing / (1 - missing)
+        return np.hypot(waves, jamming_error(packing_fraction, grains))
+
 
 SIZE_LAWS: dict[str, SizeLaw] = {  # fits of ``benchmarks size_limits``, and their spreads
     "pressure": SizeLaw(0.3546, 0.1065, 0.4407, 0.83, 0.5),
@@ -121,9 +129,7 @@ def size_error(
       >>> [round(float(size_error(0.5, nu, 256)), 3) for nu in (0.6, 0.8)]
       [0.096, 0.062]
     """
-    missing = SIZE_LAWS[average].missing(restitution, packing_fraction, grains)
-    waves = SIZE_LAWS[average].spread * missing / (1 - missing)
-    return np.hypot(waves, jamming_error(packing_fraction, grains))
+    return SIZE_LAWS[average].error(restitution, packing_fraction, grains)
 
 
 def jamming_error(packing_fraction: ArrayLike, grains: ArrayLike) -> np.ndarray:
