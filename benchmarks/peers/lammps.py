@@ -33,7 +33,7 @@ import numpy as np
 
 from benchmarks.peers.problem import Discs, Flow, Run, Stress, closing_speed, soft_timestep
 
-CURVES = {"LAMMPS": (1e3, 1e4, 3e4, 1e5, 3e5, 1e6, 1e7, 1e8)}
+CURVES = {"LAMMPS": (1e3, 1e4, 3e4, 1e5, 3e5, 1e6, 3e6, 1e7, 3e7, 1e8)}
 STEPS_PER_CONTACT = 10
 SKINS = (0.1, 0.6)
 STEPS_OF_A_LIST = 20  # aimed at, within the bounds of the skin
