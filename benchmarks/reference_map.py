@@ -6,14 +6,16 @@ cluster. Loose flows depend on N and have 6400 grains, dense ones 1600. Every se
 own, sampled over six correlation strains of each flow, and kept beside the results; all are merged.
 So a run that was stopped goes on, and another seed makes errors smaller. Where these grains are too
 few for long waves, maps of more take the place of the plane's: 6400 from ν = 0.72 to 0.77
-(``--part between``), and 16,000 up to α = 0.2 and ν = 0.73 (``--part dissipative``). Flows of
-several sizes say how averages approach those of a large system (``python -m benchmarks
-size_limits``), and a map at dt = 1e-3 what becomes of the force ratio.
+(``--part between``) and from 0.78 to 0.82 (``--part dense``), and 16,000 where collisions dissipate
+most (``--part dissipative``). Flows of several sizes say how averages approach those of a large
+system (``python -m benchmarks size_limits``), and a map at dt = 1e-3 what becomes of the force
+ratio.
 
     python -m benchmarks reference_map --first-seed 2  # the committed seeds, two hours on two cores
     python -m benchmarks reference_map --first-seed 2 --seeds 4  # two more
     python -m benchmarks reference_map --first-seed 2 --part between  # 6400 grains, an hour
-    python -m benchmarks reference_map --part dissipative --seeds 1  # 16,000, an hour and a half
+    python -m benchmarks reference_map --part dense --seeds 1  # 6400 grains, half an hour
+    python -m benchmarks reference_map --part dissipative --seeds 1  # 16,000, two hours and a half
     python -m benchmarks reference_map --part sizes  # flows of several sizes, 20 minutes
     python -m benchmarks reference_map --part check  # flows that check their law, 20 minutes
     python -m benchmarks reference_map --part coarse  # dt = 1e-3
@@ -31,16 +33,18 @@ from benchmarks.output import RESULTS, Output
 from jaxgran.environment import usable_cores
 from jaxgran.maps.results import write_dataset
 from jaxgran.maps.schema import flattened
+from jaxgran.maps.seeds import NOT_RUN
 
 PLANE = "reference.nc", "reference_between.nc", "reference_dissipative.nc"
 KEPT = RESULTS / ".reference_map"  # the maps of single seeds
 RESTITUTIONS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
 LOOSE = (0.1, 0.2, 0.3, 0.4, 0.5, 0.56, 0.6, 0.65, 0.7)
 BETWEEN = (0.72, 0.73, 0.74, 0.75, 0.76, 0.77)
-DENSE = (*BETWEEN, 0.78, 0.79, 0.8, 0.81, 0.82, 0.83)
+DENSER = (0.78, 0.79, 0.8, 0.81, 0.82)
+DENSE = (*BETWEEN, *DENSER, 0.83)
 
 
-def plane(quick: bool) -> dict[str, Any]:
+def plane(quick: bool) -> dict[str, dict[str, Any]]:
     """The arguments of ``ratio_map`` for one seed."""
     alphas, loose, dense = (
         ((0.1, 0.5, 0.9), (0.5, 0.7), (0.8,)) if quick else (RESTITUTIONS, LOOSE, DENSE)
@@ -49,12 +53,8 @@ def plane(quick: bool) -> dict[str, Any]:
     grains = [
         size for nus, size in zip((loose, dense), sizes, strict=True) for _ in nus for _ in alphas
     ]
-    return {
-        "restitution": alphas,
-        "packing_fraction": loose + dense,
-        "grains_by_point": grains,
-        "timestep": 5e-4 if quick else 1e-4,
-    }
+    chosen = {"restitution": alphas, "packing_fraction": loose + dense, "grains_by_point": grains}
+    return {"plane": chosen | {"timestep": 5e-4 if quick else 1e-4}}
 
 
 def reference_points() -> xr.Dataset:
@@ -69,7 +69,7 @@ def reference_points() -> xr.Dataset:
                 raise ValueError(f"{', '.join(PLANE)} must have the same {name}.")
         finer = with_points(data).reindex_like(points[["packing_fraction", "restitution"]])
         measured = finer.pressure.notnull()
-        if int(measured.sum()) != data.pressure.size:
+        if int(measured.sum()) != int((data.status != NOT_RUN).sum()):
             raise ValueError(f"{PLANE[0]} lacks points of another map of {', '.join(PLANE)}.")
         points = finer.where(measured, points).assign_attrs(points.attrs)
         commits.append(data.attrs["commit"])
@@ -91,27 +91,35 @@ def with_points(data: xr.Dataset) -> xr.Dataset:
     return points.assign(point_grains=ones * grains, point_seeds=ones * data.attrs["seeds"])
 
 
-def between(quick: bool) -> dict[str, Any]:
+def between(quick: bool) -> dict[str, dict[str, Any]]:
     """The arguments of ``ratio_map`` for one seed of flows of middle density, with as many grains
     as loose ones.
     """
     alphas, nus, grains = ((0.1, 0.9), (0.72,), 100) if quick else (RESTITUTIONS, BETWEEN, 6400)
-    timestep = 5e-4 if quick else 1e-4
-    return {
-        "restitution": alphas,
-        "packing_fraction": nus,
-        "grains": grains,
-        "timestep": timestep,
-    }
+    chosen = {"restitution": alphas, "packing_fraction": nus, "grains": grains}
+    return {"between": chosen | {"timestep": 5e-4 if quick else 1e-4}}
 
 
-def dissipative(quick: bool) -> dict[str, Any]:
+def dense(quick: bool) -> dict[str, dict[str, Any]]:
+    """The arguments of ``ratio_map`` for one seed of dense flows, with as many grains as loose
+    ones.
+    """
+    return {"dense": between(quick)["between"] | {"packing_fraction": (0.8,) if quick else DENSER}}
+
+
+def dissipative(quick: bool) -> dict[str, dict[str, Any]]:
     """The arguments of ``ratio_map`` for one seed of flows in which long waves are strongest."""
-    alphas, nus = ((0.1,), (0.5,)) if quick else (RESTITUTIONS[:4], (*LOOSE, *BETWEEN[:2]))
-    return between(quick) | {
-        "restitution": alphas,
-        "packing_fraction": nus,
-        "grains": 144 if quick else 16_000,
+    common = between(quick)["between"] | {"grains": 144 if quick else 16_000}
+    grids = {
+        "dissipative": (RESTITUTIONS[:4], (*LOOSE, *BETWEEN[:2])),
+        "dissipative_dense": (RESTITUTIONS[:4], BETWEEN[2:4]),
+        "dissipative_less": (RESTITUTIONS[4:7], (*LOOSE[4:], *BETWEEN[:3])),
+    }
+    if quick:
+        grids = {"dissipative": ((0.1,), (0.5,)), "dissipative_less": ((0.5,), (0.7,))}
+    return {
+        name: common | {"restitution": alphas, "packing_fraction": nus}
+        for name, (alphas, nus) in grids.items()
     }
 
 
@@ -162,7 +170,12 @@ def coarse(quick: bool) -> dict[str, dict[str, Any]]:
     }
 
 
-SEVERAL_SEEDS = {"plane": plane, "between": between, "dissipative": dissipative}
+SEVERAL_SEEDS = {
+    "plane": plane,
+    "between": between,
+    "dense": dense,
+    "dissipative": dissipative,
+}
 PARTS = {"sizes": sizes, "check": check, "coarse": coarse}
 
 
@@ -186,11 +199,12 @@ def run(
         return jg.ratio_map(**{"seeds": 1, **chosen}, **kept, workers=usable_cores())
 
     if part in SEVERAL_SEEDS:
-        settings = SEVERAL_SEEDS[part](output.quick)
+        chosen = SEVERAL_SEEDS[part](output.quick)
         merged = jg.merge_maps(
             [
-                made(f"{part}_{k}", **settings, first_seed=k)
+                made(f"{name}_{k}", **settings, first_seed=k)
                 for k in range(first_seed, first_seed + seeds)
+                for name, settings in chosen.items()
             ]
         )
         merged.attrs["command"] = (

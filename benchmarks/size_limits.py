@@ -30,6 +30,7 @@ import jaxgran as jg
 from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
 from benchmarks.reference_map import PLANE
+from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.sampling.budget import LARGE_SYSTEM, SIZE_LAWS, SizeLaw
 
@@ -86,9 +87,10 @@ def rows_of_maps(source: str, names: Sequence[str]) -> list[dict[str, Any]]:
     rows = []
     for name in names:
         data = jg.open_map(RESULTS / name)
-        chosen = [*AVERAGES, *(f"{average}_stderr" for average in AVERAGES)]
+        chosen = ["status", *AVERAGES, *(f"{average}_stderr" for average in AVERAGES)]
         frame = data.to_dataset()[chosen].to_dataframe().reset_index()
-        for record in frame.rename(columns={"point_grains": "grains"}).to_dict("records"):
+        frame = frame[frame.status != NOT_RUN].rename(columns={"point_grains": "grains"})
+        for record in frame.to_dict("records"):
             row = {axis: record[axis] for axis in ("restitution", "packing_fraction", "grains")}
             averages = {x: [record[x], record[f"{x}_stderr"]] for x in AVERAGES}
             rows.append(row | averages | {"source": source})
