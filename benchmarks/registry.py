@@ -103,7 +103,7 @@ BENCHMARKS = (
                 "--part",
                 "the plane, flows between loose and dense ones, dissipative ones of more grains, "
                 "flows of several sizes, those that check the law of the size, or a coarse step",
-                choices=("plane", "between", "dissipative", "sizes", "check", "coarse"),
+                choices=("plane", "between", "dense", "dissipative", *("sizes", "check", "coarse")),
             ),
             Option("--folder", "where the maps that are done are kept", Path),
         ),
