@@ -6,16 +6,16 @@ cluster. Loose flows depend on N and have 6400 grains, dense ones 1600. Every se
 own, sampled over six correlation strains of each flow, and kept beside the results; all are merged.
 So a run that was stopped goes on, and another seed makes errors smaller. Where these grains are too
 few for long waves, maps of more take the place of the plane's: 6400 from ν = 0.72 to 0.77
-(``--part between``) and from 0.78 to 0.82 (``--part dense``), and 16,000 where collisions dissipate
-most (``--part dissipative``). Flows of several sizes say how averages approach those of a large
-system (``python -m benchmarks size_limits``), and a map at dt = 1e-3 what becomes of the force
-ratio.
+(``--part between``), 3200 from 0.78 to 0.82 (``--part dense``), and 16,000 where collisions
+dissipate most (``--part dissipative``). Flows of several sizes say how averages approach those of a
+large system (``python -m benchmarks size_limits``), and a map at dt = 1e-3 what becomes of the
+force ratio.
 
     python -m benchmarks reference_map --first-seed 2  # the committed seeds, two hours on two cores
     python -m benchmarks reference_map --first-seed 2 --seeds 4  # two more
     python -m benchmarks reference_map --first-seed 2 --part between  # 6400 grains, an hour
-    python -m benchmarks reference_map --part dense --seeds 1  # 6400 grains, half an hour
-    python -m benchmarks reference_map --part dissipative --seeds 1  # 16,000, two hours and a half
+    python -m benchmarks reference_map --part dense --seeds 1  # 3200 grains, a quarter of an hour
+    python -m benchmarks reference_map --part dissipative --seeds 1  # 16,000, three hours
     python -m benchmarks reference_map --part sizes  # flows of several sizes, 20 minutes
     python -m benchmarks reference_map --part check  # flows that check their law, 20 minutes
     python -m benchmarks reference_map --part coarse  # dt = 1e-3
@@ -101,10 +101,11 @@ def between(quick: bool) -> dict[str, dict[str, Any]]:
 
 
 def dense(quick: bool) -> dict[str, dict[str, Any]]:
-    """The arguments of ``ratio_map`` for one seed of dense flows, with as many grains as loose
-    ones.
+    """The arguments of ``ratio_map`` for one seed of dense flows, with twice as many grains as in
+    the plane.
     """
-    return {"dense": between(quick)["between"] | {"packing_fraction": (0.8,) if quick else DENSER}}
+    nus, grains = ((0.8,), 100) if quick else (DENSER, 3200)
+    return {"dense": between(quick)["between"] | {"packing_fraction": nus, "grains": grains}}
 
 
 def dissipative(quick: bool) -> dict[str, dict[str, Any]]:
