@@ -95,14 +95,15 @@ BENCHMARKS = (
         (
             Option(
                 "--seeds",
-                "number of seeds of the first three parts, those that are kept included",
+                "number of seeds of the first four parts, those that are kept included",
                 int,
             ),
             Option("--first-seed", "the first of these seeds", int),
             Option(
                 "--part",
-                "the plane, flows between loose and dense ones, dissipative ones of more grains, "
-                "flows of several sizes, those that check the law of the size, or a coarse step",
+                "the plane, flows between loose and dense ones, dense or dissipative ones of more "
+                "grains, flows of several sizes, those that check the law of the size, or a coarse "
+                "step",
                 choices=("plane", "between", "dense", "dissipative", *("sizes", "check", "coarse")),
             ),
             Option("--folder", "where the maps that are done are kept", Path),
