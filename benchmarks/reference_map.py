@@ -35,7 +35,7 @@ from jaxgran.maps.results import write_dataset
 from jaxgran.maps.schema import flattened
 from jaxgran.maps.seeds import NOT_RUN
 
-PLANE = "reference.nc", "reference_between.nc", "reference_dissipative.nc"
+PLANE = tuple(f"reference{part}.nc" for part in ("", "_between", "_dense", "_dissipative"))
 KEPT = RESULTS / ".reference_map"  # the maps of single seeds
 RESTITUTIONS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
 LOOSE = (0.1, 0.2, 0.3, 0.4, 0.5, 0.56, 0.6, 0.65, 0.7)

@@ -87,8 +87,8 @@ BENCHMARKS = (
             *(
                 f"reference_{name}.nc"
                 for name in (
-                    *("between", "dissipative", "sizes_loose", "sizes_dense"),
-                    *("check_small", "check_large", "coarse"),
+                    *("between", "dense", "dissipative", "sizes_loose"),
+                    *("sizes_dense", "check_small", "check_large", "coarse"),
                 )
             ),
         ),

@@ -78,10 +78,10 @@ class SizeLaw(NamedTuple):
 
 
 SIZE_LAWS: dict[str, SizeLaw] = {  # fits of ``benchmarks size_limits``, and their spreads
-    "pressure": SizeLaw(0.3546, 0.1065, 0.4407, 0.83, 0.5),
-    "shear_stress": SizeLaw(0.5098, 0.0354, 4.081, 0.8077, 0.5),
-    "granular_temperature": SizeLaw(0.1685, 0.3066, 0.6245, 0.8195, 0.75),
-    "local_granular_temperature": SizeLaw(0.4219, 0.02283, 2.6, 0.8212, 1.2),
+    "pressure": SizeLaw(0.3474, 0.1088, 0.4181, 0.8293, 0.5),
+    "shear_stress": SizeLaw(0.512, 0.03458, 4.194, 0.8073, 0.4),
+    "granular_temperature": SizeLaw(0.1642, 0.3135, 0.5669, 0.8205, 0.9),
+    "local_granular_temperature": SizeLaw(0.3764, 0.02482, 2.339, 0.8296, 1.2),
 }
 
 LARGE_SYSTEM = ("force_ratio", "macroscopic_friction", *SIZE_LAWS)
