@@ -14,7 +14,7 @@ force ratio.
     python -m benchmarks reference_map --first-seed 2  # the committed seeds, two hours on two cores
     python -m benchmarks reference_map --first-seed 2 --seeds 4  # two more
     python -m benchmarks reference_map --first-seed 2 --part between  # 6400 grains, an hour
-    python -m benchmarks reference_map --part dense --seeds 1  # 3200 grains, a quarter of an hour
+    python -m benchmarks reference_map --part dense --seeds 1  # 3200 grains, 25 minutes
     python -m benchmarks reference_map --part dissipative --seeds 1  # 16,000, three hours
     python -m benchmarks reference_map --part sizes  # flows of several sizes, 20 minutes
     python -m benchmarks reference_map --part check  # flows that check their law, 20 minutes
@@ -22,6 +22,7 @@ force ratio.
     python -m benchmarks reference_map --quick       # 3 × 3 points of 64 and 100 grains, a minute
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ from jaxgran.maps.results import write_dataset
 from jaxgran.maps.schema import flattened
 from jaxgran.maps.seeds import NOT_RUN
 
-PLANE = tuple(f"reference{part}.nc" for part in ("", "_between", "_dense", "_dissipative"))
+PLANE = "reference.nc", "reference_between.nc", "reference_dense.nc", "reference_dissipative.nc"
 KEPT = RESULTS / ".reference_map"  # the maps of single seeds
 RESTITUTIONS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
 LOOSE = (0.1, 0.2, 0.3, 0.4, 0.5, 0.56, 0.6, 0.65, 0.7)
@@ -53,8 +54,17 @@ def plane(quick: bool) -> dict[str, dict[str, Any]]:
     grains = [
         size for nus, size in zip((loose, dense), sizes, strict=True) for _ in nus for _ in alphas
     ]
-    chosen = {"restitution": alphas, "packing_fraction": loose + dense, "grains_by_point": grains}
-    return {"plane": chosen | {"timestep": 5e-4 if quick else 1e-4}}
+    return {"plane": grid(quick, alphas, loose + dense, grains_by_point=grains)}
+
+
+def grid(
+    quick: bool, alphas: Sequence[float], nus: Sequence[float], **grains: int | Sequence[int]
+) -> dict[str, Any]:
+    """The arguments of ``ratio_map`` for restitutions and packing fractions at the time step of the
+    plane.
+    """
+    timestep = 5e-4 if quick else 1e-4
+    return {"restitution": alphas, "packing_fraction": nus, "timestep": timestep, **grains}
 
 
 def reference_points() -> xr.Dataset:
@@ -96,32 +106,28 @@ def between(quick: bool) -> dict[str, dict[str, Any]]:
     as loose ones.
     """
     alphas, nus, grains = ((0.1, 0.9), (0.72,), 100) if quick else (RESTITUTIONS, BETWEEN, 6400)
-    chosen = {"restitution": alphas, "packing_fraction": nus, "grains": grains}
-    return {"between": chosen | {"timestep": 5e-4 if quick else 1e-4}}
+    return {"between": grid(quick, alphas, nus, grains=grains)}
 
 
 def dense(quick: bool) -> dict[str, dict[str, Any]]:
     """The arguments of ``ratio_map`` for one seed of dense flows, with twice as many grains as in
     the plane.
     """
-    nus, grains = ((0.8,), 100) if quick else (DENSER, 3200)
-    return {"dense": between(quick)["between"] | {"packing_fraction": nus, "grains": grains}}
+    alphas, nus, grains = ((0.1, 0.9), (0.8,), 100) if quick else (RESTITUTIONS, DENSER, 3200)
+    return {"dense": grid(quick, alphas, nus, grains=grains)}
 
 
 def dissipative(quick: bool) -> dict[str, dict[str, Any]]:
     """The arguments of ``ratio_map`` for one seed of flows in which long waves are strongest."""
-    common = between(quick)["between"] | {"grains": 144 if quick else 16_000}
-    grids = {
+    planes = {
         "dissipative": (RESTITUTIONS[:4], (*LOOSE, *BETWEEN[:2])),
         "dissipative_dense": (RESTITUTIONS[:4], BETWEEN[2:4]),
         "dissipative_less": (RESTITUTIONS[4:7], (*LOOSE[4:], *BETWEEN[:3])),
     }
     if quick:
-        grids = {"dissipative": ((0.1,), (0.5,)), "dissipative_less": ((0.5,), (0.7,))}
-    return {
-        name: common | {"restitution": alphas, "packing_fraction": nus}
-        for name, (alphas, nus) in grids.items()
-    }
+        planes = {"dissipative": ((0.1,), (0.5,)), "dissipative_less": ((0.5,), (0.7,))}
+    grains = 144 if quick else 16_000
+    return {name: grid(quick, *axes, grains=grains) for name, axes in planes.items()}
 
 
 def sizes(quick: bool) -> dict[str, dict[str, Any]]:

@@ -104,7 +104,7 @@ BENCHMARKS = (
                 "the plane, flows between loose and dense ones, dense or dissipative ones of more "
                 "grains, flows of several sizes, those that check the law of the size, or a coarse "
                 "step",
-                choices=("plane", "between", "dense", "dissipative", *("sizes", "check", "coarse")),
+                choices=("plane", "between", "dense", "dissipative", "sizes", "check", "coarse"),
             ),
             Option("--folder", "where the maps that are done are kept", Path),
         ),
@@ -183,7 +183,7 @@ BENCHMARKS = (
     Benchmark(
         "speed_vs_accuracy",
         "What does accuracy cost, here and in other programs?",
-        (25, 3),
+        (35, 3),
         ("speed_vs_accuracy.json", "speed_vs_accuracy.png"),
         one_core=True,
         module="peers.compare",

@@ -192,9 +192,9 @@ def nearly_elastic(constants: Sequence[float]) -> Iterator[dict[str, Any]]:
 def compared(small: xr.Dataset, large: xr.Dataset) -> Iterator[dict[str, Any]]:
     """How flows agree with the same ones of more grains, for each average and smaller N: root mean
     squares as they are, corrected, and of sampling; the half-width (rms) of the 95 % interval, and
-    the share of flows within. Both corrections follow from one law, so
-    the difference of their errors counts; the excess of a force ratio has no law of its own, so
-    that of the smaller flow counts in full.
+    the share of flows within. Both corrections follow from one law, so the difference of their
+    errors counts; the excess of a force ratio has no law of its own, so that of the smaller flow
+    counts in full.
     """
     for name, grains in product(LARGE_SYSTEM, small.grains.values.tolist()):
         path, own = f"{name}_large_system", small.sel(grains=grains)

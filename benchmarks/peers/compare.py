@@ -12,7 +12,7 @@ with jaxgran, at a time step of 3e-5 and a tolerance of 1e-6 over a longer strai
 ``front.py`` compares equal work: the cheapest settings within 3 %, at overlaps no deeper than those
 of the other program. ``chart.py`` draws the figure.
 
-    python -m benchmarks speed_vs_accuracy           # about 25 minutes
+    python -m benchmarks speed_vs_accuracy           # about 35 minutes
     python -m benchmarks speed_vs_accuracy --quick   # one flow of 256 discs, under 3 minutes
 """
 
