@@ -14,7 +14,7 @@ force ratio.
     python -m benchmarks reference_map --first-seed 2  # the committed seeds, two hours on two cores
     python -m benchmarks reference_map --first-seed 2 --seeds 4  # two more
     python -m benchmarks reference_map --first-seed 2 --part between  # 6400 grains, an hour
-    python -m benchmarks reference_map --part dense --seeds 1  # 3200 grains, 25 minutes
+    python -m benchmarks reference_map --part dense  # 3200 grains, 50 minutes
     python -m benchmarks reference_map --part dissipative --seeds 1  # 16,000, three hours
     python -m benchmarks reference_map --part sizes  # flows of several sizes, 20 minutes
     python -m benchmarks reference_map --part check  # flows that check their law, 20 minutes
