@@ -61,12 +61,12 @@ class CorrelationLaws:
 
 
 MEASURED_LAWS = CorrelationLaws(
-    length=np.array([0.2246, 0.02584, 1.444]),
-    length_stderr=np.array([0.00761, 0.003345, 0.02961]),
-    pairs=np.array([0.3819, 0.01604, 1.609]),
-    pairs_stderr=np.array([0.02308, 0.0008051, 0.0138]),
+    length=np.array([0.2245, 0.02589, 1.444]),
+    length_stderr=np.array([0.007616, 0.00335, 0.02961]),
+    pairs=np.array([0.3816, 0.01606, 1.609]),
+    pairs_stderr=np.array([0.02311, 0.0008068, 0.01381]),
     jamming_fraction=np.array(0.8386),
-    scatter=np.array([0.1263, 0.1572, 0.149]),
+    scatter=np.array([0.1263, 0.1573, 0.149]),
     restitution_range=np.array([0.1, 0.95]),
     packing_fraction_range=np.array([0.1, 0.82]),
     fitted_to="294 flows of N = 1600 to 16000, dt = 1e-4",
