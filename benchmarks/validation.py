@@ -6,7 +6,7 @@ Event-driven discs have no time step and, as inelastic hard discs, no contact du
 collapse the row says so. The classical Gauss–Seidel loop has the time step, the activation rule and
 the tolerance of jaxgran, and so the same force ratio.
 
-    python -m benchmarks validation           # about 20 minutes on two cores
+    python -m benchmarks validation           # about 40 minutes on two cores
     python -m benchmarks validation --quick   # two flows of 128 grains, about a minute
 """
 
@@ -54,7 +54,7 @@ class Plan(NamedTuple):
     strain: float
 
 
-FULL = Plan(tuple(product((0.9, 0.7, 0.5, 0.2), (0.2, 0.5, 0.7, 0.8))), 1000, 4, 8, 5.0)
+FULL = Plan(tuple(product((0.9, 0.7, 0.5, 0.2), (0.2, 0.5, 0.7, 0.8))), 1000, 8, 8, 5.0)
 QUICK = Plan(((0.9, 0.6), (0.2, 0.7)), 128, 2, 4, 1.0)
 
 
