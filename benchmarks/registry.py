@@ -46,7 +46,7 @@ BENCHMARKS = (
     Benchmark(
         "validation",
         "Are stresses, temperature and force ratio those of independent programs?",
-        (40, 1),
+        (25, 1),
         ("validation.json", "validation.png"),
     ),
     Benchmark(

@@ -6,7 +6,7 @@ Event-driven discs have no time step and, as inelastic hard discs, no contact du
 collapse the row says so. The classical Gauss–Seidel loop has the time step, the activation rule and
 the tolerance of jaxgran, and so the same force ratio.
 
-    python -m benchmarks validation           # about 40 minutes on two cores
+    python -m benchmarks validation           # about 25 minutes on two cores
     python -m benchmarks validation --quick   # two flows of 128 grains, about a minute
 """
 
