@@ -218,6 +218,13 @@ BENCHMARKS = (
         one_core=True,
     ),
     Benchmark(
+        "timestep_error",
+        "What of a sample foretells the error of its pressure from the time step?",
+        (30, 0.5),
+        ("timestep_error.json",),
+        one_core=True,
+    ),
+    Benchmark(
         "size_study",
         "What does the number of grains do to stresses, temperature and force ratio?",
         (20, 1),

@@ -1,0 +1,128 @@
+"""What foretells the error of the pressure from the time step: over restitution and packing
+fraction, the pressure of time steps from 1e-2 to 3e-5, and what a sample itself knows of its step.
+
+Each seed reaches its steady state at dt = 1e-3. From there the coarser time steps are sampled, then
+the finer ones in turn, each after a strain of two. The error is that against the finest step, with
+its standard error over all seeds.
+
+    python -m benchmarks timestep_error           # half an hour on two cores
+    python -m benchmarks timestep_error --quick   # two flows, under a minute
+"""
+
+import multiprocessing
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from itertools import product
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxgran as jg
+from benchmarks.output import Output
+from jaxgran.environment import usable_cores
+from jaxgran.sampling.sample import estimates
+
+START = 1e-3  # time step of the steady state
+RELAXATION = 2.0  # strain at a new time step before its sample
+ALLOWED = 0.03  # relative error of the pressure that has to be foretold
+
+advance = jax.jit(jg.advance)
+
+
+class Plan(NamedTuple):
+    """Restitutions and packing fractions, grains, seeds, strain of each sample and time steps."""
+
+    restitution: tuple[float, ...]
+    packing_fraction: tuple[float, ...]
+    grains: int
+    seeds: int
+    strain: float
+    timesteps: tuple[float, ...]
+
+
+FULL = Plan(
+    (0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95),
+    (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.78, 0.8, 0.82),
+    256,
+    4,
+    150.0,
+    (1e-2, 3.16e-3, 1e-3, 3.16e-4, 1e-4, 3.16e-5),
+)
+QUICK = Plan((0.9, 0.5), (0.8,), 64, 2, 10.0, (1e-2, 1e-3, 1e-4))
+
+
+def run(output: Output) -> None:
+    """Run the plan on all cores and write ``timestep_error`` as JSON, a row a flow and step."""
+    plan = QUICK if output.quick else FULL
+    flows = list(product(plan.packing_fraction, plan.restitution))
+    tasks = [(*flow, seed) for flow in flows for seed in range(plan.seeds)]
+    dear_first = sorted(tasks, key=lambda task: (-task[0], task[1]))
+    with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
+        parts = pool.map(samples, [plan] * len(tasks), dear_first)
+        done = dict(zip(dear_first, parts, strict=True))
+    rows = []
+    for nu, alpha in flows:
+        seeds = [done[nu, alpha, seed] for seed in range(plan.seeds)]
+        rows += rows_of_flow(plan, alpha, nu, seeds)
+    output.write_rows("timestep_error", {"plan": plan._asdict()}, "rows", rows)
+
+
+def samples(plan: Plan, task: tuple[float, float, int]) -> dict[float, jg.Sample]:
+    """A sample of every time step of one seed of a flow."""
+    nu, alpha, seed = task
+
+    def flow(timestep: float) -> jg.ShearFlow:
+        return jg.ShearFlow(plan.grains, alpha, nu, timestep)
+
+    steady = state = jg.prepare(flow(START), jax.random.key(seed))
+    sampled = {}
+    for timestep in sorted(plan.timesteps, reverse=True):
+        before = steady if timestep >= START else state
+        relaxed, _ = advance(flow(timestep), before, jnp.int32(round(RELAXATION / timestep)))
+        state, sample = jg.sample(flow(timestep), relaxed, plan.strain)
+        sampled[timestep] = jax.tree.map(np.asarray, sample)
+    return sampled
+
+
+def rows_of_flow(
+    plan: Plan, alpha: float, nu: float, seeds: Sequence[dict[float, jg.Sample]]
+) -> list[dict]:
+    """Pressure and its error at every time step of a flow, and what its samples know of the
+    step.
+    """
+    finest = min(plan.timesteps)
+    measured = {dt: estimates([seed[dt] for seed in seeds]) for dt in plan.timesteps}
+    truth, its_error = (float(x["pressure"]) for x in measured[finest])
+    rows = []
+    for dt in plan.timesteps:
+        value, error = measured[dt]
+        tallies = [seed[dt].tally for seed in seeds]
+
+        def total(name: str, tallies: list = tallies) -> float:
+            return float(sum(np.sum(getattr(tally, name)) for tally in tallies))
+
+        pressure, stderr = float(value["pressure"]), float(error["pressure"])
+        rows.append(
+            {
+                "restitution": alpha,
+                "packing_fraction": nu,
+                "timestep": dt,
+                "pressure": pressure,
+                "stderr": stderr,
+                "shear_stress": float(value["shear_stress"]),
+                "shear_stderr": float(error["shear_stress"]),
+                "temperature": float(value["granular_temperature"]),
+                "error": pressure / truth - 1,
+                "error_stderr": np.hypot(stderr / pressure, its_error / truth).item(),
+                "deep_share": total("deep_contacts") / total("contacts"),
+                "mean_overlap": total("overlap") / total("contacts"),
+                "largest_overlap": max(float(np.max(x.largest_overlap)) for x in tallies),
+                "contacts": total("contacts") / total("steps"),
+                "loaded": total("loaded_contacts") / total("steps"),
+                "collisions": total("collisions") / total("steps"),
+                "force_ratio": float(value["force_ratio"]),
+            }
+        )
+    return rows
