@@ -72,6 +72,11 @@ FULL = Plan(
 QUICK = Plan(((0.5, 0.6, 256), (0.8, 0.2, 256)), {64: 2, 256: 1})
 
 
+def flow_of_size(alpha: float, nu: float, grains: int) -> jg.ShearFlow:
+    """The flow at one number of grains."""
+    return jg.ShearFlow(grains=grains, restitution=alpha, packing_fraction=nu, timestep=1e-3)
+
+
 def measured_flow(plan: Plan, flow: int, grains: int, folder: Path) -> tuple[int, int]:
     """Measure one flow with all its seeds and keep the result in the folder; returns the number of
     the flow and N.
@@ -80,7 +85,7 @@ def measured_flow(plan: Plan, flow: int, grains: int, folder: Path) -> tuple[int
     start = time.perf_counter()
     memory = expected_memory(plan, flow, grains, folder)
     before, strain = max(PREPARED * memory, LEAST_STRAIN), max(SAMPLED * memory, LEAST_STRAIN)
-    setting = jg.ShearFlow(grains=grains, restitution=alpha, packing_fraction=nu, timestep=1e-3)
+    setting = flow_of_size(alpha, nu, grains)
     seeds = [
         one_seed(setting, before, strain, 100 * flow + seed) for seed in range(plan.seeds[grains])
     ]
@@ -210,7 +215,8 @@ def expected_memory(plan: Plan, flow: int, grains: int, folder: Path) -> float:
     if not smaller:
         return 20.0 if nu < 0.7 else 5.0
     row = read_flow(folder, alpha, nu, max(smaller))
-    means = {name: np.mean(x, axis=0) for name, x in sample_of(row, max(smaller)).averages.items()}
+    batch = sample_of(row, flow_of_size(alpha, nu, max(smaller)))
+    means = {name: np.mean(x, axis=0) for name, x in batch.averages.items()}
     larger = grains / max(smaller)
     return memory_of(means, nu, grains, larger * row["area"][0])
 
@@ -233,10 +239,12 @@ def read_flow(folder: Path, alpha: float, nu: float, grains: int) -> dict[str, n
         return dict(file)
 
 
-def sample_of(row: dict[str, np.ndarray], grains: int) -> Sample:
+def sample_of(row: dict[str, np.ndarray], flow: jg.ShearFlow) -> Sample:
     """The seeds of a flow that is done as a batch of samples."""
     tally = Tally(**{name: row[f"tally_{name}"] for name in TABLE})
-    return Sample(tally, row["area"], np.ones(len(row["area"])), grains)
+    area = row["area"]
+    numbers = jax.tree.map(lambda x: np.full(len(area), x), flow)
+    return Sample(tally, area, 4 / np.pi * flow.packing_fraction * area, numbers)
 
 
 def measure(plan: Plan, folder: Path) -> None:
@@ -294,7 +302,7 @@ def result(plan: Plan, flow: int, grains: int, folder: Path) -> dict:
     """
     alpha, nu, _ = plan.flows[flow]
     row = read_flow(folder, alpha, nu, grains)
-    batch = sample_of(row, grains)
+    batch = sample_of(row, flow_of_size(alpha, nu, grains))
     seeds = [jax.tree.map(lambda x, k=k: x[k], batch) for k in range(len(row["area"]))]
     values, errors = estimates(seeds)
     measured = {

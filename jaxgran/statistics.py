@@ -25,9 +25,10 @@ _FEWEST_GROUPS = (
     4  # the spread over fewer groups is too uncertain; single blocks are used in any case
 )
 _MOST_BLOCKS = 32  # per seed in ``standard_errors``; more are merged
-_TIMES = np.geomspace(0.2, 20, 12)  # correlation times, in blocks
+_TIMES = np.geomspace(0.2, 100, 16)  # correlation times, in blocks
 _WHITE_SHARES = np.array([0.0, 0.5, 0.9])  # share of white noise in the variance of a block
-_EXPECTED_TIME = 2.5  # blocks, beyond which the prior of the correlation time falls
+_EXPECTED_TIME = 2.5  # blocks, beyond which the prior of an unknown correlation time falls
+_LONGER = 1.5  # centre of the prior of a correlation time over the expected one
 _LEVEL = 0.95  # of an interval of 1.96 standard errors
 _NORMAL_QUANTILE = 1.959964
 _NEWTON_STEPS = 4
@@ -51,7 +52,10 @@ class _Posterior(NamedTuple):
 
 
 def standard_errors(
-    estimate: Callable[[Any], Mapping[str, Any]], sums: Any, lengths: np.ndarray | None = None
+    estimate: Callable[[Any], Mapping[str, Any]],
+    sums: Any,
+    lengths: np.ndarray | None = None,
+    correlation: float | None = None,
 ) -> tuple[Estimates, Estimates]:
     """Estimates from the sums over all blocks of all seeds, and their standard errors.
 
@@ -67,26 +71,29 @@ def standard_errors(
     with flat priors for the mean and for ln σ, the mean has a Student's t distribution with M - 1
     degrees of freedom for M blocks in all. Its centre is the generalised least-squares mean μ =
     1'R⁻¹x / 1'R⁻¹1, its scale S / √((M - 1) 1'R⁻¹1) with S² = (x - μ)'R⁻¹(x - μ), and its weight
-    |R|^(-1/2) (1'R⁻¹1)^(-1/2) S^(1 - M). The interval is that of the mixture over 12 correlation
-    times from 0.2 to 20 blocks and three values of w, around the plain mean. The prior is t^(1/4) /
-    (1 + (t/2.5)²) in ln t and flat in w.
+    |R|^(-1/2) (1'R⁻¹1)^(-1/2) S^(1 - M). The interval is that of the mixture over 16 correlation
+    times from 0.2 to 100 blocks and three values of w, around the plain mean. The prior is flat in
+    w. In ln t it is Gaussian with a standard deviation of one about 1.5 times the expected
+    correlation time, or about one block where that is longer; and t^(1/4) / (1 + (t/2.5)²) where
+    none is expected. A series that is shorter than its correlation cannot show it: without an
+    expected time its error is far too small.
 
     Blocks of shorter seeds are merged until they last about as long as those of the longest, so
     that one correlation time holds for all, see ``merged_blocks``.
 
-    With 32 blocks per seed, intervals for sheared flows have their nominal coverage if a seed is at
-    least eight correlation strains long, and for most flows from four (``python -m benchmarks
-    coverage``).
+    How often intervals for sheared flows hold is measured by ``python -m benchmarks coverage``.
 
     Args:
       estimate: maps a pytree of sums with any leading axes to by_name estimates with the same
         leading axes.
       sums: pytree of arrays of shape (seeds, blocks, ...), in any units.
       lengths: (seeds,) durations in any unit; None where all are equal.
+      correlation: duration of one independent sample in this unit, 2t, as expected within a factor
+        of three; None where nothing is known.
 
     Returns:
-      Estimates and standard errors, without the axes of seeds and blocks. The error is NaN where it
-      cannot be known: for fewer than two blocks, and where all blocks are equal.
+      Estimates and standard errors, without the axes of seeds and blocks. The error is zero where
+      all blocks are equal within rounding, and NaN for fewer than two blocks.
 
     Examples:
       Eight blocks with a trend. Independent blocks would have an error of 0.87.
@@ -99,7 +106,11 @@ def standard_errors(
     whole, influence, scale, by_name = _influences(estimate, sums, lengths)
     if sum(map(len, influence)) < 2:
         return by_name(whole), by_name(np.full_like(whole, np.nan))
-    return by_name(whole), by_name(scale * _half_width(_posterior(influence)) / _NORMAL_QUANTILE)
+    expected = None
+    if lengths is not None and correlation is not None:
+        expected = correlation / 2 * max(map(len, influence)) / np.max(lengths)
+    half = _half_width(_posterior(influence, expected))
+    return by_name(whole), by_name(scale * half / _NORMAL_QUANTILE)
 
 
 def merged_blocks(lengths: np.ndarray | None, seeds: int, blocks: int) -> np.ndarray:
@@ -211,7 +222,7 @@ def _influences(
     ``by_name``.
 
     The influence of a block is (B - 1) times the mean of the leave-one-out estimates minus the one
-    without the block, for B blocks in all, divided by the scale (its root mean square, NaN for
+    without the block, for B blocks in all, divided by the scale (its root mean square, zero for
     rounding only). A seed has at most ``_MOST_BLOCKS`` blocks.
     """
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
@@ -225,8 +236,9 @@ def _influences(
     without = flat[1:].astype(float) if total > 1 else np.full(flat.shape, np.nan)
     influence = (total - 1) * (without.mean(axis=0) - without)
     scale = np.sqrt(np.mean(influence**2, axis=0))
-    influence = influence / np.where(scale > 0, scale, 1)
-    scale = np.where(scale > _ROUNDING * total * np.abs(flat[0]), scale, np.nan)
+    alternating = (-1.0) ** np.arange(len(influence))[:, None]  # stands for blocks without scatter
+    influence = np.where(scale > 0, influence / np.where(scale > 0, scale, 1), alternating)
+    scale = np.where(scale <= _ROUNDING * total * np.abs(flat[0]), 0, scale)
     return flat[0], np.split(influence, np.cumsum(counts)[:-1]), scale, by_name
 
 
@@ -249,21 +261,26 @@ def _correlation_models(blocks: int) -> tuple[np.ndarray, np.ndarray]:
     return vectors, eigenvalues
 
 
-def _prior() -> np.ndarray:
-    """Logarithm of the prior (models,): times, and the shares of white noise of each."""
-    return np.repeat(
-        np.log(_TIMES**0.25 / (1 + (_TIMES / _EXPECTED_TIME) ** 2)), len(_WHITE_SHARES)
-    )
+def _prior(expected: float | None) -> np.ndarray:
+    """Logarithm of the prior (models,): times, and the shares of white noise of each. The expected
+    correlation time is in blocks.
+    """
+    if expected is None:
+        of_times = np.log(_TIMES**0.25 / (1 + (_TIMES / _EXPECTED_TIME) ** 2))
+    else:
+        centre = np.clip(_LONGER * expected, 1, _TIMES[-1])
+        of_times = -(np.log(_TIMES / centre) ** 2) / 2
+    return np.repeat(of_times, len(_WHITE_SHARES))
 
 
-def _posterior(seeds: Sequence[np.ndarray]) -> _Posterior:
+def _posterior(seeds: Sequence[np.ndarray], expected: float | None = None) -> _Posterior:
     """Posterior of n means from series (blocks, n) of plain mean zero, one a seed; see
     ``standard_errors``.
     """
     count = seeds[0].shape[1]
     freedom = sum(map(len, seeds)) - 1
     information = weighted = square = determinant = np.zeros(1)
-    prior = _prior()
+    prior = _prior(expected)
     for blocks in sorted({len(seed) for seed in seeds}):
         series = np.stack([seed for seed in seeds if len(seed) == blocks])
         vectors, eigenvalues = _correlation_models(blocks)

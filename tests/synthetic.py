@@ -5,6 +5,7 @@ flow.
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import jax
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from jaxgran.maps.replica import Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
@@ -45,7 +47,7 @@ def random_tally(rng: np.random.Generator, *shape: int, status: int = 0) -> Tall
         values[name] = rng.gamma(20.0, 1.0, (*shape, *tail))
         if name in counts:
             values[name] = np.ceil(values[name])
-    values["deep_contacts"] = np.zeros(shape)
+    values |= {name: np.zeros(shape) for name in ("deep_contacts", "momentum_drift")}
     return Tally(**{**values, "status": np.full(shape, status, np.int32)})
 
 
@@ -55,8 +57,18 @@ def random_replica(
     """Return a replica of a map with random sums, the same area for all and a strain of 3 before
     the sample.
     """
-    tally, grains = random_tally(rng, BLOCKS, status=status), settings.flows()[point].grains
-    return Replica(Sample(tally, np.float64(100.0), np.float64(1.0), grains), int(status), 3.0)
+    tally = random_tally(rng, BLOCKS, status=status)
+    return Replica(sample_of_tally(tally, settings.flows()[point]), int(status), 3.0)
+
+
+def sample_of_tally(tally: Tally, flow: ShearFlow, area: float = 100.0) -> Sample:
+    """Return the sample of a tally in a cell of this area, or of one of a batch, of grains of mass
+    one.
+    """
+    replicas = np.shape(tally.steps)[:-1]
+    numbers = jax.tree.map(lambda x: np.full(replicas, x)[()], flow)
+    mass = np.full(replicas, float(flow.grains))[()]
+    return Sample(tally, np.full(replicas, area)[()], mass, numbers)
 
 
 def random_instant(seed: int, grains: int = 20, pairs: int = 7) -> ForceNetwork:

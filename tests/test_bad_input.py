@@ -107,7 +107,7 @@ def verdict(function: Callable[[Any], Any], value: Any) -> str:
 KEY = jax.random.key(0)
 KEYS = jax.random.split(KEY)
 SIDE = np.sqrt(GRAINS * np.pi / 4 / 0.6)
-PLACES = np.random.default_rng(0).uniform(0, SIDE, (1, GRAINS, 2))
+PLACES = np.stack(np.divmod(np.arange(GRAINS), 6), axis=-1)[None] * SIDE / 6  # of a lattice
 SEEN = jax.tree.map(lambda x: x[0], snapshot_of(PLACES, side=SIDE))
 POINT = np.zeros((1, 2))
 

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import random_tally
+from synthetic import random_tally, sample_of_tally
 from test_statistics import ar1
 
+from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.correlation_strain import flow_correlation_strain
-from jaxgran.sampling.sample import Sample, correlation_strains
+from jaxgran.sampling.sample import correlation_strains
 from jaxgran.sampling.thresholds import RELAXATION_STRAIN
 
 
@@ -58,7 +59,7 @@ def test_correlation_strain_of_seeds_of_unequal_length_is_that_of_their_flow():
             tally = replace(
                 random_tally(rng, 256), duration=np.full(256, float(length)), kinetic_moment=moment
             )
-            seeds.append(Sample(tally, np.float64(100.0), np.float64(1.0), 100))
+            seeds.append(sample_of_tally(tally, ShearFlow(100, 0.5, 0.6, 1e-3)))
         found.append(correlation_strains(seeds)["granular_temperature"])
     assert np.mean(found) == pytest.approx(
         80, rel=0.25

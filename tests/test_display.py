@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic import random_tally
+from synthetic import random_tally, sample_of_tally
 
 import jaxgran as jg
 from jaxgran.model.display import with_error
 from jaxgran.model.flow import ShearFlow
-from jaxgran.sampling.sample import BLOCKS, Sample
+from jaxgran.sampling.sample import BLOCKS
 
 TALLIES = random_tally(np.random.default_rng(0), 1000, BLOCKS)
 VALUES = [ShearFlow(64, 0.5, 0.6, 1e-4), ShearFlow(64, np.linspace(0.1, 0.9, 1000), 0.6, 1e-4)]
-VALUES += [Sample(TALLIES, np.full(1000, 81.0), np.ones(1000), 64)]
+VALUES += [sample_of_tally(TALLIES, jg.ShearFlow(64, 0.5, 0.6, 1e-3))]
 
 
 @pytest.mark.parametrize("value", VALUES, ids=["flow", "batch", "samples"])

@@ -3,8 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from synthetic import random_tally
+from synthetic import random_tally, sample_of_tally
 
+from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.drift import is_drifting
 from jaxgran.sampling.sample import BLOCKS, Sample
 
@@ -19,7 +20,7 @@ def sample_of(seed: int, growth: float) -> Sample:
     noise = np.exp(0.05 * np.random.default_rng(seed).normal(size=(BLOCKS, 1, 1)))
     moments = dict.fromkeys(("contact_moment", "kinetic_moment"), factor * noise * even)
     tally = replace(tally, duration=np.full(BLOCKS, 1.0), **moments)
-    return Sample(tally, np.float64(100.0), np.float64(1.0), 64)
+    return sample_of_tally(tally, ShearFlow(64, 0.5, 0.6, 1e-3))
 
 
 def test_a_drift_that_all_seeds_share_is_one() -> None:

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 from flows import flow_of
+from synthetic import sample_of_tally
 
 import jaxgran as jg
 from jaxgran.contact.projected_methods import BarzilaiBorwein
@@ -18,7 +19,7 @@ from jaxgran.theory.enskog import collisional_transfer
 from jaxgran.theory.steady_shear import contact_value
 
 TENSOR = np.array([[1.3, -0.35], [-0.35, 0.8]])
-GRAINS, NU, ALPHA, AREA, DURATION, COLLISIONS = 400, 0.5, 0.6, 400 * np.pi / 4 / 0.5, 0.1, 2000
+GRAINS, NU, ALPHA, AREA, DURATION, COLLISIONS = 400, 0.5, 0.6, 400 * np.pi / 4 / 0.5, 10.0, 2000
 
 
 def measured_rates(sample: Sample) -> dict[str, float]:
@@ -71,7 +72,7 @@ def chaotic_tally(
 
 def sample_of(tallies: list[Tally], grains: int = GRAINS, area: float = AREA) -> Sample:
     blocks = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *tallies)
-    return Sample(blocks, np.float64(area), np.float64(1.0), grains)
+    return sample_of_tally(blocks, replace(FLOW, grains=grains), area)
 
 
 def chaotic_sample(seed: int, **factors: float) -> Sample:

@@ -25,7 +25,7 @@ from jaxgran.sampling.blocks import Batch
 from jaxgran.sampling.heated import heat_replica, replicas_of_keys
 from jaxgran.sampling.observe import advance_batch, reporting
 from jaxgran.sampling.prediction import predicted
-from jaxgran.sampling.sample import relative_error
+from jaxgran.sampling.sample import Sample, relative_error
 from jaxgran.sampling.sample_batch import sample_batch
 from jaxgran.sampling.steady_state import prepare, prepare_batch
 from jaxgran.sampling.timestep import check_timestep
@@ -283,9 +283,7 @@ def test_report_is_told_every_replica_step(batch) -> None:
 
 def test_a_sample_lasts_six_memories_and_one_of_less_than_four_says_so(batch, monkeypatch) -> None:
     monkeypatch.setattr(extension, "LEAST_SAMPLE", 0.5)
-    monkeypatch.setattr(
-        extension, "sampled_correlation_strain", lambda *_: ready.correlation_strain
-    )
+    monkeypatch.setattr(Sample, "correlation_strain", property(lambda _: ready.correlation_strain))
     ready = batch._replace(status=np.zeros(2, int), correlation_strain=np.array([0.2, 0.4]))
     _, long = sample_batch(ready, None)
     np.testing.assert_allclose(np.sum(long.tally.duration, axis=1), [1.2, 2.4])
@@ -302,9 +300,7 @@ def test_a_sample_for_an_error_is_at_least_twice_as_long_and_its_longest_strain_
     monkeypatch.setattr(extension, "LEAST_SAMPLE", 0.32)
     monkeypatch.setattr(extension, "LONGEST_STRAIN", 0.64)
     monkeypatch.setattr(extension, "LONGEST_CORRELATION_STRAINS", 0)
-    monkeypatch.setattr(
-        extension, "sampled_correlation_strain", lambda *_: ready.correlation_strain
-    )
+    monkeypatch.setattr(Sample, "correlation_strain", property(lambda _: ready.correlation_strain))
     ready = batch._replace(status=np.zeros(2, int), correlation_strain=np.full(2, 0.01))
     for error, status in ((1e9, Status.ok), (1e-9, Status.imprecise)):
         end, measured = sample_batch(ready, None, error=error)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import one_sentence, random_tally, refused, snapshot_of
+from synthetic import one_sentence, random_tally, refused, sample_of_tally, snapshot_of
 
 import jaxgran as jg
 from jaxgran.model.checks import InputError
@@ -22,9 +22,7 @@ FLOWS = jg.ShearFlow(16, [0.5, 0.9], 0.6, 1e-3)
 SERIES = snapshot_of(
     np.random.default_rng(0).uniform(0, 40, (TIMES, 5, 2)), [[(0, 1, 0.1)], [], [], [(2, 3, 0.2)]]
 )
-SAMPLES = Sample(
-    random_tally(np.random.default_rng(1), 2, BLOCKS), np.full(2, 81.0), np.ones(2), 16
-)
+SAMPLES = sample_of_tally(random_tally(np.random.default_rng(1), 2, BLOCKS), FLOWS[0])
 VALUES = {
     "ShearFlow": FLOWS,
     "State": SERIES.state,
@@ -49,7 +47,7 @@ def test_a_value_equals_its_copy_and_nothing_else(name: str) -> None:
 def test_nan_equals_nan_and_the_number_of_grains_counts() -> None:
     lost = replace(SAMPLES, area=np.array([np.nan, 1.0]))
     assert lost == jax.tree.map(jnp.asarray, lost) and lost != SAMPLES
-    assert replace(SAMPLES, grains=17) != SAMPLES
+    assert replace(SAMPLES, flow=replace(SAMPLES.flow, grains=17)) != SAMPLES
 
 
 def test_equal_flows_have_equal_hashes_however_they_name_the_rule() -> None:

@@ -46,7 +46,6 @@ from jaxgran.model.state import (
     State,
     kinetic_energy,
     relative_momentum,
-    require_match,
     require_state,
     status_if_finite,
 )
@@ -62,7 +61,6 @@ def require_advance(flow: ShearFlow, state: State, steps: Any) -> None:
     require_number(
         "steps", steps, lambda x: (x.dtype.kind in "iu") & (x >= 0) & (x <= MAX_STEPS), words
     )
-    require_match(flow, state)
 
 
 def contact_buffers(grains: int) -> tuple[int, ...]:

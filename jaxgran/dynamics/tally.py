@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from jaxgran.contact.law import ContactTerms
 from jaxgran.model.batches import equal_values
 from jaxgran.model.indexing import taken
-from jaxgran.model.status import DEEP_SHARE, Status
+from jaxgran.model.status import DEEP_SHARE, Status, worse
 
 # What adds to a sum. The running sums of an engine stand in this order, and within it in the order
 # of the table.
@@ -129,11 +129,8 @@ class Tally:
         """The status, or ``deep_overlap`` if that is worse and too large a share of the contacts
         overlaps deeply.
         """
-        xp = jnp if isinstance(self.status, jax.Array) else np
-        deep = xp.where(
-            self.deep_contacts > DEEP_SHARE * self.contacts, Status.deep_overlap, Status.ok
-        )
-        return xp.maximum(self.status, deep.astype(self.status.dtype))
+        deep = self.deep_contacts > DEEP_SHARE * self.contacts
+        return worse(self.status, deep, Status.deep_overlap)
 
     def __add__(self, other: "Tally") -> "Tally":
         return jax.tree.map(lambda *both: jnp.stack(both), self, other).total(axis=0)

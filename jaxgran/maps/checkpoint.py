@@ -40,6 +40,7 @@ from jaxgran.maps.provenance import made_with, versions_of
 from jaxgran.maps.replica import Key, Replica, ReplicaId, replica_ids
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.sampling.sample import Sample
@@ -161,11 +162,11 @@ class Checkpoint:
     def _read(self) -> None:
         """Read the replicas of this map, and which of its batches have a journal."""
         files = set(self.folder.iterdir())
-        own_sums = sums_by_name(self.settings)
-        for key, replica in self._ids.items():
+        own_sums, flows = sums_by_name(self.settings), self.settings.flows()
+        for key in self._ids:
             path = self._path(key)
             if path in files and (content := self._content(path)):
-                self.done[key] = _replica_of(replica.grains, own_sums, *content)
+                self.done[key] = _replica_of(flows[key[0]], own_sums, *content)
         keys: dict[tuple, Key] = {replica: key for key, replica in self._ids.items()}
         for path in sorted(self.folder.glob(f"journal-*-{self._digest}.npz")):
             if content := self._content(path):
@@ -231,18 +232,19 @@ def _content_of(replica: Replica) -> tuple[dict[str, np.ndarray], dict[str, Any]
     arrays = {
         "tally": flat_tally(sample.tally, np.shape(sample.tally.steps)),
         "area": np.asarray(sample.area),
-        "shear_rate": np.asarray(sample.shear_rate),
+        "mass": np.asarray(sample.mass),
     }
     arrays |= {f"state_{k}": np.asarray(x) for k, x in enumerate(jax.tree.leaves(replica.state))}
     return arrays, {"status": int(replica.status), "strain": float(replica.strain)}
 
 
 def _replica_of(
-    grains: int, own_sums: Any, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]
+    flow: ShearFlow, own_sums: Any, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]
 ) -> Replica:
     """The replica of ``_content_of``."""
     tally = tally_from_flat(arrays["tally"], np.dtype(precision()), own_sums)
-    sample = Sample(tally, arrays["area"][()], arrays["shear_rate"][()], grains)
+    numbers = jax.tree.map(arrays["area"].dtype.type, flow)
+    sample = Sample(tally, arrays["area"][()], arrays["mass"][()], numbers)
     leaves: list[Any] = [arrays[name] for name in sorted(arrays) if name.startswith("state_")]
     state = State(Grains(*leaves[:2]), *leaves[2:]) if leaves else None
     return Replica(sample, about["status"], about["strain"], state)

@@ -1,12 +1,13 @@
 """The points of a map: their dimensions, and the averages of the replicas of each."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from jax.typing import ArrayLike
 
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
@@ -14,10 +15,14 @@ from jaxgran.maps.settings_checks import stack_of_any_size
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import GIVEN_UP
-from jaxgran.sampling.correlation_strain import flow_correlation_strain
 from jaxgran.sampling.drift import is_drifting
 from jaxgran.sampling.observables import OBSERVABLES
-from jaxgran.sampling.sample import Sample, correlation_strains, estimates
+from jaxgran.sampling.sample import (
+    Sample,
+    correlation_strains,
+    estimates,
+    lengths,
+)
 
 
 @dataclass(frozen=True)
@@ -90,17 +95,15 @@ def point_averages(settings: MapSettings, replicas: Mapping[Key, Replica | None]
         samples=_samples(settings, replicas),
     )
     for point, samples in averages.samples.items():
-        flow, (values, stderrs) = flows[point], estimates(samples)
+        flow = flows[point]
+        values, stderrs = estimates(samples)
         for name in OBSERVABLES:
             averages.values[name][point] = values[name]
             averages.stderrs[name][point] = stderrs[name]
-        area, shear_rate = samples[0].area, samples[0].shear_rate
-        # of the grains, which is the sum of their squared diameters
-        mass = 4 / np.pi * float(flow.packing_fraction) * area
-        strain = averages.correlation_strain[point] = flow_correlation_strain(
-            values, flow.grains, mass, area, shear_rate
-        )
-        averages.drifting[point] = is_drifting(samples, float(strain))
+        _, correlation_time = lengths(samples)
+        strain = correlation_time * float(flow.shear_rate)
+        averages.correlation_strain[point] = strain
+        averages.drifting[point] = is_drifting(samples, strain)
         independent = correlation_strains(samples)
         for name in scalars:
             averages.observable_correlation[name][point] = independent[name]
@@ -114,9 +117,18 @@ def _samples(
     given up.
     """
     by_point: dict[int, Sequence[Sample]] = {}
-    for point in range(len(settings.flows())):
+    for point, flow in enumerate(settings.flows()):
         seeds = [replicas.get((point, seed)) for seed in range(settings.seeds)]
-        samples = [x.sample for x in seeds if x is not None and x.status < GIVEN_UP]
+        samples = [
+            replace(x.sample, mass=mass_of_grains(flow.packing_fraction, x.sample.area))
+            for x in seeds
+            if x is not None and x.status < GIVEN_UP
+        ]  # the same bits whether the replicas have run or were read
         if samples:
             by_point[point] = samples
     return by_point
+
+
+def mass_of_grains(packing_fraction: Any, area: ArrayLike) -> Any:
+    """Mass of all grains of a map, the sum of their squared diameters."""
+    return 4 / np.pi * float(packing_fraction) * np.asarray(area)

@@ -43,5 +43,5 @@ def seed_strains(
     for key, replica in replicas.items():
         if replica is not None:
             before[key] = replica.strain
-            sampled[key] = replica.sample.tally.duration.sum() * replica.sample.shear_rate
+            sampled[key] = replica.sample.tally.duration.sum() * replica.sample.flow.shear_rate
     return sampled, before

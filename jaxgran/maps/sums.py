@@ -4,12 +4,13 @@ of one run.
 
 from collections.abc import Mapping
 
+import jax
 import numpy as np
 import xarray as xr
 
 from jaxgran.dynamics.tally import flat_tally, tally_from_flat
 from jaxgran.maps.own_observables import sums_by_name
-from jaxgran.maps.points import PointGrid
+from jaxgran.maps.points import PointGrid, mass_of_grains
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import flag_names, flattened
 from jaxgran.maps.seeds import NOT_RUN
@@ -69,8 +70,9 @@ def replicas_of(data: xr.DataTree, settings: MapSettings) -> dict[Key, Replica |
             replicas[key] = None
             continue
         tally = tally_from_flat(sums[key], dtype, own_sums)
-        shear_rate = dtype.type(flows[point].shear_rate)
-        sample = Sample(tally, dtype.type(area[key]), shear_rate, flows[point].grains)
+        flow = jax.tree.map(dtype.type, flows[point])
+        of_grains = dtype.type(mass_of_grains(flow.packing_fraction, area[key]))
+        sample = Sample(tally, dtype.type(area[key]), of_grains, flow)
         state = states.pop(point, None) if status[key] < GIVEN_UP else None
         replicas[key] = Replica(sample, int(status[key]), float(strain[key]), state)
     return replicas

@@ -1,7 +1,7 @@
 """State: a sheared packing at one instant, the check of a state, and its energy and momentum."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import jax
@@ -11,13 +11,17 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxgran.model.batches import Indexable, equal_values
-from jaxgran.model.checks import InputError, is_traced
+from jaxgran.model.checks import InputError, concrete_or_none
 from jaxgran.model.display import are_numbers, rounded, text_of
 from jaxgran.model.flow import ShearFlow, require_flow
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import Status
 
-_ROUNDING = 1e-5  # of a packing fraction or a diameter in float32, with some room
+_ROUNDING = 1e-5  # of a packing fraction in float32, with some room
+_ACCEPTED = {
+    **dict.fromkeys(("radii", "masses", "side"), lambda x: (x > 0) & np.isfinite(x)),
+    **dict.fromkeys(("positions", "velocities", "tilt"), np.isfinite),
+}
 
 
 @jax.tree_util.register_dataclass
@@ -67,6 +71,21 @@ class State(Indexable):
             },
         )
 
+    def without_momentum(self) -> Self:
+        """The same state seen from its centre of mass, as ``sample`` requires it; also of a batch.
+
+        Examples:
+          >>> grains = Grains(radii=np.array([0.5, 0.5]), masses=np.array([1.0, 3.0]))
+          >>> velocities = np.array([[4.0, 0.0], [0.0, 0.0]])
+          >>> state = State(grains, np.array([[0.0, 0.0], [2.0, 2.0]]), velocities, 4.0, 0.0)
+          >>> state.without_momentum().velocities.tolist()
+          [[3.0, 0.0], [-1.0, 0.0]]
+        """
+        masses = self.grains.masses[..., None]
+        momentum = (masses * self.velocities).sum(axis=-2, keepdims=True)
+        mean = momentum / masses.sum(axis=-2, keepdims=True)
+        return replace(self, velocities=self.velocities - mean)
+
     @property
     def _axes(self) -> tuple[int, ...]:
         return np.shape(self.side)
@@ -79,53 +98,85 @@ class State(Indexable):
 
 
 def require_state(flow: ShearFlow, state: State) -> None:
-    """Raise an InputError unless these are one flow and one state with its number of grains, in one
-    precision.
+    """Raise an InputError unless these are one flow and one state of it: a state of its shapes, in
+    one precision, finite, with positive sizes and masses, of the packing fraction of the flow, and
+    without a pair of grains nearer than half of their contact distance.
+
+    The engines take the packing fraction and the grains from the state. Of traced numbers only
+    shapes and precision are checked.
     """
     require_flow(flow)
-    if not isinstance(state, State) or jnp.shape(state.positions) != (flow.grains, 2):
-        given = type(state).__name__
-        if isinstance(state, State):
-            given = f"of positions {jnp.shape(state.positions)}"
+    if not isinstance(state, State):
         raise InputError(
-            f"state must be one State of {flow.grains} grains, best from prepare, not {given}."
+            f"state must be one State of {flow.grains} grains, best from prepare, not "
+            f"{type(state).__name__}."
         )
-    precisions = sorted(
-        {leaf.dtype.name for leaf in jax.tree.leaves(state) if hasattr(leaf, "dtype")}
-    )
-    if len(precisions) > 1:
+    arrays = {"radii": state.grains.radii, "masses": state.grains.masses}
+    arrays |= {f.name: getattr(state, f.name) for f in fields(state) if f.name != "grains"}
+    _require_arrays(flow.grains, arrays)
+    known = {name: concrete_or_none(x) for name, x in arrays.items()}
+    for name, numbers in known.items():
+        if numbers is not None and not np.all(_ACCEPTED[name](numbers)):
+            positive = "" if _ACCEPTED[name] is np.isfinite else "positive and "
+            raise InputError(f"state must have only {positive}finite {name}, best from prepare.")
+    radii, side = known["radii"], known["side"]
+    if radii is None or side is None:
+        return
+    if (nu := concrete_or_none(flow.packing_fraction)) is not None:
+        of_state = float(np.pi * np.sum(np.square(radii, dtype=float)) / float(side) ** 2)
+        if abs(of_state - nu) > _ROUNDING:
+            raise InputError(
+                f"packing_fraction must be {of_state:.6g}, which the state has, not {nu:g}: a flow "
+                "with another one begins with a state of its own, from prepare."
+            )
+    if known["positions"] is not None and known["tilt"] is not None:
+        _require_apart(radii, known["positions"], float(side), float(known["tilt"]))
+
+
+def _require_arrays(grains: int, arrays: dict[str, Any]) -> None:
+    """Raise an InputError unless the arrays have the shapes of a state, and one precision."""
+    for name, x in arrays.items():
+        shape = {"positions": (grains, 2), "velocities": (grains, 2), "side": (), "tilt": ()}.get(
+            name, (grains,)
+        )
+        if np.shape(x) != shape:
+            raise InputError(
+                f"state must be one State of {grains} grains, best from prepare, of {name} "
+                f"{shape}, not {np.shape(x)}."
+            )
+    precisions = sorted({np.dtype(x.dtype).name for x in arrays.values() if hasattr(x, "dtype")})
+    if len(precisions) > 1 or not {*precisions} <= {"float32", "float64"}:
         raise InputError(
             f"state must be of one precision, and its numbers are {' and '.join(precisions)}: "
             "jax.tree.map(lambda x: x.astype(float), state) makes them one."
         )
 
 
-def require_match(flow: ShearFlow, state: State) -> None:
-    """Raise an InputError if flow and state differ in packing fraction or polydispersity; traced
-    values pass.
-
-    The engines take both from the state. Sizes other than those of ``polydisperse`` belong to no
-    polydispersity.
+def _require_apart(radii: np.ndarray, positions: np.ndarray, side: float, tilt: float) -> None:
+    """Raise an InputError if two grains are nearer than half of their contact distance, which no
+    time step leaves.
     """
-    if is_traced(flow, state):
-        return
-    radii = np.sort(np.asarray(state.grains.radii, float))
-    of_state = {
-        "packing_fraction": float(np.pi * np.sum(radii**2) / np.asarray(state.side, float) ** 2)
-    }
-    quantiles = (2 * np.arange(radii.size) + 1) / radii.size - 1
-    spread = (2 * radii[-1] - 1) / quantiles[-1]
-    if spread > _ROUNDING and np.allclose(
-        2 * radii, 1 + spread * quantiles, rtol=0, atol=_ROUNDING
-    ):
-        of_state["polydispersity"] = float(spread)
-    for name, value in of_state.items():
-        if abs(value - float(getattr(flow, name))) > _ROUNDING:
-            raise InputError(
-                f"{name} must be {value:.6g}, which the state has, not "
-                f"{float(getattr(flow, name)):g}: a flow with "
-                "another one begins with a state of its own, from prepare."
-            )
+    from scipy.spatial import KDTree
+
+    rows = np.floor(positions[:, 1] / side)
+    x, y = positions[:, 0] - rows * tilt * side, positions[:, 1] - rows * side
+    x = x - side * np.floor(x / side)
+    reach = float(np.max(radii))  # half of the largest contact distance
+    column, row = (k.reshape(-1, 1) for k in np.meshgrid([0, -1, 1], [0, -1, 1]))
+    images = np.stack([x + (column + row * (tilt - np.rint(tilt))) * side, y + row * side], axis=-1)
+    images = images.reshape(-1, 2)
+    near = np.all((images >= -reach) & (images < side + reach), axis=-1)
+    numbers = np.flatnonzero(near)
+    i, j = numbers[KDTree(images[near]).query_pairs(reach, output_type="ndarray")].T
+    distances = np.linalg.norm(images[i] - images[j], axis=-1)
+    i, j = i % len(radii), j % len(radii)
+    too_near = (distances < (radii[i] + radii[j]) / 2) & (i != j)
+    if np.any(too_near):
+        k = np.flatnonzero(too_near)[0]
+        raise InputError(
+            "state must have grains that are further apart than half of their contact distance, "
+            f"and the centres of grains {i[k]} and {j[k]} are {distances[k]:.3g} diameters apart."
+        )
 
 
 def kinetic_energy(grains: Grains, velocities: Array) -> Float[Array, ""]:

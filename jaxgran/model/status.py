@@ -1,6 +1,7 @@
 """What can go wrong in a replica, in order of severity; the worst status is kept."""
 
 from enum import IntEnum
+from typing import Any
 
 
 class Status(IntEnum):
@@ -30,6 +31,15 @@ class Status(IntEnum):
 GIVEN_UP = Status.infeasible  # from here on a replica is advanced no further, and has no averages
 DEEP_OVERLAP = 1e-2  # σ
 DEEP_SHARE = 0.1  # of the contacts; up to twice this share, stresses change by less than 2 %
+# |Σ m c| over Σ m |c|, of which temperature and stresses contain about the square
+LARGEST_DRIFT = 1e-2
+
+
+def worse(status: Any, condition: Any, other: Status) -> Any:
+    """The worse of a status and another one that holds under a condition, of JAX where they are."""
+    is_worse = (condition & (status < other.value)).astype(status.dtype)
+    return status + is_worse * (other.value - status)
+
 
 MEANINGS = {
     "iteration_limit": "some contact solve ended above the tolerance",
@@ -37,8 +47,8 @@ MEANINGS = {
     "more grains or a larger error",
     "short_sample": "the sample lasts only a few correlation strains, so its errors may be too "
     "small",
-    "not_steady": "temperature or pressure still drifted, sample longer, or prepare longer by "
-    "`equilibrate`",
+    "not_steady": "temperature, pressure or total momentum still drifted, sample longer, or "
+    "prepare longer by `equilibrate`",
     "deep_overlap": "more than a tenth of the contacts overlap by more than 1e-2 diameters, take a "
     "shorter time step",
     "infeasible": "no impulses satisfy the contact law, the packing is jammed, lower the packing "

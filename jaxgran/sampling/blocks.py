@@ -16,6 +16,7 @@ from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow, steps_of_blocks, steps_of_strain
 from jaxgran.model.state import State
 from jaxgran.model.status import GIVEN_UP, Status
+from jaxgran.sampling.correlation_strain import total_mass
 from jaxgran.sampling.observe import AdvanceBatch
 from jaxgran.sampling.sample import Sample
 
@@ -69,8 +70,9 @@ def advance_by_block(
 def sample_of_blocks(flow: ShearFlow, state: State, tallies: Sequence[Tally]) -> Sample:
     """The sample of a batch from the tallies (replicas,) of successive blocks."""
     tally = jax.tree.map(lambda *x: np.stack(x, axis=1), *tallies)
-    side, shear_rate = np.asarray(state.side), np.asarray(flow.shear_rate)
-    return Sample(tally, side**2, shear_rate, flow.grains)
+    side = np.asarray(state.side)
+    numbers = jax.tree.map(lambda x: np.asarray(x, side.dtype), flow)
+    return Sample(tally, side**2, total_mass(state.grains), numbers)
 
 
 def shear_by_block(

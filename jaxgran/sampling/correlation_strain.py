@@ -20,7 +20,6 @@ from jax.typing import ArrayLike
 from jaxgran.model.checks import is_traced
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import Status
-from jaxgran.sampling.sample import Sample
 from jaxgran.sampling.thresholds import FEWEST_CORRELATION_STRAINS, RELAXATION_STRAIN
 
 _WAVE = 0.35  # correlation strain of the longest waves over γ̇ ℓ √(ρ/p)
@@ -58,13 +57,6 @@ def flow_correlation_strain(
         waves = _WAVE * xp.asarray(shear_rate) * xp.sqrt(xp.asarray(mass) / pressure)
     return xp.maximum(
         RELAXATION_STRAIN, xp.fmax(*(xp.where(xp.isfinite(x), x, 0.0) for x in (heating, waves)))
-    )
-
-
-def sampled_correlation_strain(sample: Sample, grains: Grains) -> Any:
-    """``flow_correlation_strain`` at the averages of a sample, or of each of a batch."""
-    return flow_correlation_strain(
-        sample.averages, sample.grains, total_mass(grains), sample.area, sample.shear_rate
     )
 
 

@@ -52,7 +52,7 @@ def is_drifting(samples: Sequence[Sample], correlation_strain: float) -> bool:
     Returns:
       Whether they drift; True if a value is not finite.
     """
-    strain = np.mean([np.sum(sample.tally.duration) * sample.shear_rate for sample in samples])
+    strain = np.mean([np.sum(sample.tally.duration) * sample.flow.shear_rate for sample in samples])
     memory = max(CLUSTER_STRAIN, correlation_strain / 2)
     correlation = float(np.exp(-strain / DRIFT_BLOCKS / memory))
     means = np.mean([_series(sample) for sample in samples], axis=0)
@@ -62,7 +62,7 @@ def is_drifting(samples: Sequence[Sample], correlation_strain: float) -> bool:
 def _series(sample: Sample) -> np.ndarray:
     """ln P and ln T of a sample in blocks, (2, blocks)."""
     blocks = jax.tree.map(lambda x: x.reshape(DRIFT_BLOCKS, -1, *x.shape[1:]), sample.tally)
-    area, shear_rate = (np.full(DRIFT_BLOCKS, x) for x in (sample.area, sample.shear_rate))
-    by_block = averages(blocks.total(axis=1), area, sample.grains, shear_rate)
+    area, shear_rate = (np.full(DRIFT_BLOCKS, x) for x in (sample.area, sample.flow.shear_rate))
+    by_block = averages(blocks.total(axis=1), area, sample.flow.grains, shear_rate)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.log(np.stack([by_block["pressure"], by_block["granular_temperature"]]))

@@ -54,7 +54,7 @@ from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.sampling.prediction import size_classes
-from jaxgran.sampling.sample import Sample, durations
+from jaxgran.sampling.sample import Sample, lengths
 from jaxgran.statistics import Estimates, standard_errors
 from jaxgran.theory.enskog import Collisions, collisional_transfer, enskog_collisions
 from jaxgran.theory.mixture import mixture_of
@@ -108,7 +108,7 @@ def measured_over_enskog(
         lambda *x: np.stack([np.asarray(part) for part in x]), *(seed.tally for seed in seeds)
     )
     return standard_errors(
-        partial(_factors, flow, grains, np.asarray(seeds[0].area)), sums, durations(seeds)
+        partial(_factors, flow, grains, np.asarray(seeds[0].area)), sums, *lengths(seeds)
     )
 
 

@@ -4,7 +4,7 @@ follow from them; see ``sampler`` for how it is taken.
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -16,8 +16,10 @@ from jaxgran.dynamics.tally import TABLE, Tally
 from jaxgran.model.batches import Indexable, equal_values, in_numpy
 from jaxgran.model.checks import InputError, is_traced, require_untraced
 from jaxgran.model.display import are_numbers, rounded, text_of
-from jaxgran.model.status import Status
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.status import LARGEST_DRIFT, Status, worse
 from jaxgran.sampling.averages import averages
+from jaxgran.sampling.correlation_strain import flow_correlation_strain
 from jaxgran.sampling.observables import OBSERVABLES, Observables
 from jaxgran.statistics import (
     Estimates,
@@ -68,14 +70,14 @@ def _computed_once(compute: Callable[["Sample"], T]) -> T:
 class Sample(Observables, Indexable):
     """A measured strain of one replica; a batch has a leading (replicas,) axis everywhere.
 
-    ==========  =========  ====  =================================================
-    field       shape      unit  meaning
-    ==========  =========  ====  =================================================
-    tally       (blocks,)  –     sums over the steps of each block of strain
-    area        ()         σ²    area of the cell
-    shear_rate  ()         1/t   γ̇
-    grains      static     –     number of grains
-    ==========  =========  ====  =================================================
+    =====  =========  ====  =================================================
+    field  shape      unit  meaning
+    =====  =========  ====  =================================================
+    tally  (blocks,)  –     sums over the steps of each block of strain
+    area   ()         σ²    area of the cell
+    mass   ()         m     mass of all grains
+    flow   ShearFlow  –     parameters of the flow, in the precision of the sums
+    =====  =========  ====  =================================================
 
     Every observable is an attribute, such as ``sample.pressure``: the average over all blocks, in
     units of m, σ and the time unit t of the shear rate (1/γ̇ at the default γ̇ = 1). ``averages``
@@ -86,18 +88,18 @@ class Sample(Observables, Indexable):
 
     tally: Tally
     area: Float[Array | np.ndarray, "*replicas"]
-    shear_rate: Float[Array | np.ndarray, "*replicas"]
-    grains: int = field(metadata={"static": True})
+    mass: Float[Array | np.ndarray, "*replicas"]
+    flow: ShearFlow
 
     __eq__ = equal_values
 
     def __repr__(self) -> str:
         numbers = [getattr(self.tally, name) for name in TABLE]
         if (
-            not are_numbers(*numbers, self.area, self.shear_rate)
+            not are_numbers(*numbers, self.area, *jax.tree.leaves(self.flow))
             or np.ndim(self.tally.contact_moment) < 3
         ):
-            return text_of("Sample", {"grains": self.grains, "area": self.area})
+            return text_of("Sample", {"grains": self.flow.grains, "area": self.area})
         single, averages, status = not self._axes, self.averages, np.asarray(self.status)
         counts = Counter(Status(int(code)).name for code in status.flat).most_common()
         names = (name if single else f"{name} ({count})" for name, count in counts)
@@ -105,7 +107,7 @@ class Sample(Observables, Indexable):
             "Sample",
             {
                 **({} if single else {"replicas": status.size}),
-                "grains": self.grains,
+                "grains": self.flow.grains,
                 "strain": rounded(self.strain),
                 **{name: averages[name] for name in _SHOWN},
                 "status": ", ".join(names),
@@ -125,14 +127,20 @@ class Sample(Observables, Indexable):
     @property
     def strain(self) -> Float[Array | np.ndarray, "*replicas"]:
         """The sampled strain, in whole time steps."""
-        return self._total.duration * in_numpy(self.shear_rate)
+        return self._total.duration * in_numpy(self.flow.shear_rate)
+
+    @property
+    def correlation_strain(self) -> Float[Array | np.ndarray, "*replicas"]:
+        """The strain of one independent sample, see ``flow_correlation_strain``."""
+        return _correlation_strain(self, self.averages)
 
     @property
     def status(self) -> Int[Array | np.ndarray, "*replicas"]:
-        """The worst status, see ``Tally.outcome``; ``short_sample`` below four correlation
-        strains.
+        """The worst status, see ``Tally.outcome``; ``short_sample`` below four correlation strains,
+        and ``not_steady`` if the total momentum has become a part of the averages.
         """
-        return self._total.outcome
+        drifting = self._total.momentum_drift > LARGEST_DRIFT
+        return worse(self._total.outcome, drifting, Status.not_steady)
 
     @property
     def observed_sums(self) -> Any:
@@ -157,7 +165,7 @@ class Sample(Observables, Indexable):
 
     @_computed_once
     def _averages(self) -> Mapping[str, Array | np.ndarray]:
-        return averages(self._total, self.area, self.grains, self.shear_rate)
+        return averages(self._total, self.area, self.flow.grains, self.flow.shear_rate)
 
     @_computed_once
     def _errors(self) -> dict[str, np.ndarray]:
@@ -230,7 +238,7 @@ def observed_estimates(
     sums = jax.tree.map(lambda *x: np.stack(list(map(np.asarray, x))), *parts)
     total = jax.tree.map(lambda x: x.sum(axis=(0, 1)), sums)
     structure = jax.tree.structure(jax.eval_shape(estimate_of_sums, *total))
-    values, errors = standard_errors(leaves_by_number, sums, durations(seeds))
+    values, errors = standard_errors(leaves_by_number, sums, *lengths(seeds))
     return structure.unflatten(values.values()), structure.unflatten(errors.values())
 
 
@@ -238,15 +246,38 @@ def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
     """Averages over all blocks of several replicas of one flow, and their ``standard_errors``.
 
     For an extreme, such as the largest overlap, the value is the largest of all blocks. Its error
-    is the standard deviation over the blocks.
+    is the standard deviation over the blocks. Averages that differ from their value without
+    clusters only where grains collide in clusters have at least the error of ``_unseen``.
     """
     average, sums = _stacked(seeds)
-    values, errors = standard_errors(average, sums, durations(seeds))
+    values, errors = standard_errors(average, sums, *lengths(seeds))
+    for name, error in _unseen(values, np.sum(sums.collisions)).items():
+        errors[name] = np.hypot(errors[name], error)
     by_block = average(sums)
     extremes = {name: by_block[name] for name, row in OBSERVABLES.items() if row.extreme}
     largest = {name: np.asarray(x.max()) for name, x in extremes.items()}
     spread = {name: np.asarray(x.std() if x.size > 1 else np.nan) for name, x in extremes.items()}
     return values | largest, errors | spread
+
+
+def _unseen(values: Estimates, collisions: np.ndarray) -> Estimates:
+    """Standard errors of the averages that only clusters change, from clusters that a sample may
+    have missed.
+
+    Of n collisions without any in a cluster, up to 3/n may be in clusters with a probability of 5 %
+    (the rule of three), which is 1.96 standard errors. A cluster adds about the impulse of another
+    mean collision, and has two contacts.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        missed = 3 / 1.96 / np.asarray(collisions)
+        pressure = np.trace(values["binary_stress"]) / 2
+        by_component = missed * pressure / np.abs(values["binary_stress"])
+    return {
+        "force_ratio": missed,
+        "stress_ratio": by_component,
+        "cluster_pressure_share": 2 * missed,
+        "cluster_shear_share": 2 * by_component[0, 1],
+    }
 
 
 def relative_error(measured: Sample) -> float:
@@ -269,18 +300,28 @@ def correlation_strains(seeds: Sequence[Sample]) -> Estimates:
     this block.
     """
     average, sums = _stacked(seeds)
-    strains = durations(seeds)
-    lengths = correlation_length(average, sums, strains)
-    count = merged_blocks(strains, *sums.duration.shape).sum()
-    block = np.sum(sums.duration) / count * np.asarray(seeds[0].shear_rate)
+    durations, _ = lengths(seeds)
+    in_blocks = correlation_length(average, sums, durations)
+    count = merged_blocks(durations, *sums.duration.shape).sum()
+    block = np.sum(sums.duration) / count * np.asarray(seeds[0].flow.shear_rate)
     return {
-        name: length * block for name, length in lengths.items() if not OBSERVABLES[name].extreme
+        name: length * block for name, length in in_blocks.items() if not OBSERVABLES[name].extreme
     }
 
 
-def durations(seeds: Sequence[Sample]) -> np.ndarray:
-    """The sampled time of each replica, (seeds,)."""
-    return np.array([np.sum(seed.tally.duration) for seed in seeds])
+def lengths(seeds: Sequence[Sample]) -> tuple[np.ndarray, float]:
+    """The sampled time of each replica, (seeds,), and the correlation strain of the flow in this
+    unit.
+    """
+    average, sums = _stacked(seeds)
+    strain = _correlation_strain(seeds[0], average(sums.total(axis=(0, 1))))
+    return np.sum(sums.duration, axis=1), float(strain / np.asarray(seeds[0].flow.shear_rate))
+
+
+def _correlation_strain(sample: Sample, averages: Mapping[str, Any]) -> Any:
+    """``flow_correlation_strain`` at some averages of the flow of a sample."""
+    flow, mass, area = in_numpy((sample.flow, sample.mass, sample.area))
+    return flow_correlation_strain(averages, flow.grains, mass, area, flow.shear_rate)
 
 
 def _stacked(seeds: Sequence[Sample]) -> tuple[Callable[[Tally], dict[str, Array]], Tally]:
@@ -292,5 +333,5 @@ def _stacked(seeds: Sequence[Sample]) -> tuple[Callable[[Tally], dict[str, Array
         lambda *x: np.stack(list(map(np.asarray, x))), *(seed.tally for seed in seeds)
     )
     return partial(
-        averages, area=first.area, grains=first.grains, shear_rate=first.shear_rate
+        averages, area=first.area, grains=first.flow.grains, shear_rate=first.flow.shear_rate
     ), sums

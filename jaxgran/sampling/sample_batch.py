@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from jaxgran.model.status import GIVEN_UP, Status
 from jaxgran.sampling.blocks import Batch, shear_by_block
-from jaxgran.sampling.correlation_strain import length_status, sampled_correlation_strain
+from jaxgran.sampling.correlation_strain import length_status
 from jaxgran.sampling.observe import AdvanceBatch, advance_batch
 from jaxgran.sampling.sample import BLOCKS, Sample, relative_error
 from jaxgran.sampling.thresholds import (
@@ -61,9 +61,7 @@ def sample_batch(
         batch, added = shear_by_block(batch, added_strain, BLOCKS // 2, advance)
         strains = strains + added_strain
         sample = _extended(sample, added, extended)
-    batch = batch._replace(
-        correlation_strain=sampled_correlation_strain(sample, batch.state.grains)
-    )
+    batch = batch._replace(correlation_strain=sample.correlation_strain)
     of_length = length_status(strains, batch.correlation_strain)
     of_error = np.where(imprecise, Status.imprecise, Status.ok)
     return batch._replace(

@@ -41,7 +41,7 @@ def dataset_of(sample: "Sample") -> xr.Dataset:
         )
     variables |= observed
     coordinates = {axis: ["x", "y"] for axis in TENSOR_AXES}
-    return xr.Dataset(variables, coordinates, {"grains": sample.grains})
+    return xr.Dataset(variables, coordinates, {"grains": sample.flow.grains})
 
 
 def _own_variables(sample: "Sample", replicas: tuple[str, ...]) -> dict[str, Any]:

@@ -28,13 +28,14 @@ from jaxgran.model.checks import (
     two_digits,
 )
 from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
-from jaxgran.model.state import State, require_match, require_state
+from jaxgran.model.state import State, require_state
 from jaxgran.sampling.blocks import advance_by_block, sample_of_blocks
-from jaxgran.sampling.correlation_strain import length_status, sampled_correlation_strain
+from jaxgran.sampling.correlation_strain import length_status, total_mass
 from jaxgran.sampling.observe import Observe, advance_and_observe, advance_batch
 from jaxgran.sampling.sample import BLOCKS, Sample
 
 MOST_BLOCKS = 10**6
+_LARGEST_MOMENTUM = 1e-4  # |Σ m c| over Σ m |c| at the start; rounding leaves 1e-6 at most
 _SMALLEST_MOTION = 20  # of a grain at velocity γ̇σ in one step, in roundings of a position
 
 
@@ -68,8 +69,7 @@ def sample(
     flight; their averages are accurate up to the strain of a flight, about 1e-3.
 
     Args:
-      flow: parameters of the state, with its packing fraction and polydispersity; or those
-        (replicas,) of a batch.
+      flow: parameters of the state, with its packing fraction; or those (replicas,) of a batch.
       state: the flow at the beginning, usually from ``prepare``; or a batch of states.
       strain: strain γ̇t to sample, rounded to whole time steps; for a batch also (replicas,). A new
         value does not recompile.
@@ -90,11 +90,11 @@ def sample(
       The final state and the sample; those of a batch have a leading (replicas,) axis.
 
     Raises:
-      InputError: (a ValueError) the axes of a batch differ; the state has another packing fraction
-        or polydispersity than the flow; the flow is not sheared; the strain is not a positive
-        number, is shorter than one time step a block, or is longer than 2**31 - 1 time steps;
-        positions in float32 cannot resolve the time step; the result of ``observe`` is not summed
-        over contacts; or the engine cannot do this.
+      InputError: (a ValueError) the axes of a batch differ; the state is not one of this flow, has
+        numbers that are not finite, or a total momentum; the flow is not sheared; the strain is not
+        a positive number, is shorter than one time step a block, or is longer than 2**31 - 1 time
+        steps; positions in float32 cannot resolve the time step; the result of ``observe`` is not
+        summed over contacts; or the engine cannot do this.
 
     Examples:
       The fabric of the contacts that carry a force:
@@ -139,8 +139,17 @@ def _require_sheared_state(blocks: int, flow: ShearFlow, state: State, strain: A
     """Raise an InputError unless a flow can shear a state by a strain of so many blocks."""
     require_state(flow, state)
     require_strain(flow, strain, blocks)
-    require_match(flow, state)
     check_precision(flow, state)
+    if is_traced(state.velocities, state.grains.masses):
+        return
+    momenta = np.asarray(state.grains.masses)[:, None] * np.asarray(state.velocities)
+    total, scale = np.linalg.norm(momenta.sum(axis=0)), np.linalg.norm(momenta, axis=1).sum()
+    if total > _LARGEST_MOMENTUM * scale:
+        raise InputError(
+            f"state must have no total momentum, as temperature and stresses would contain it, and "
+            f"it has {total / scale:.2g} of the sum of the momenta of its grains: "
+            "state.without_momentum() removes it."
+        )
 
 
 @partial(jax.jit, static_argnames=("blocks", "observe"))
@@ -162,8 +171,9 @@ def _sample(
             state,
             steps,
         )
-    shear_rate = jnp.asarray(flow.shear_rate, state.side.dtype)
-    return state, _with_length(Sample(tally, state.side**2, shear_rate, flow.grains), state)
+    numbers = jax.tree.map(lambda x: jnp.asarray(x, state.side.dtype), flow)
+    measured = Sample(tally, state.side**2, total_mass(state.grains), numbers)
+    return state, _with_length(measured)
 
 
 def _sample_with_callback(
@@ -178,7 +188,7 @@ def _sample_with_callback(
     flow, start, strain = batch
 
     def result(end: State, tallies: Sequence[Tally]) -> tuple[State, Sample]:
-        measured = _with_length(sample_of_blocks(flow, end, tallies), end)
+        measured = _with_length(sample_of_blocks(flow, end, tallies))
         return jax.tree.map(lambda x: jnp.asarray(x[0] if single else x), (end, measured))
 
     advance = partial(advance_batch, observe=observe, threads=usable_threads())
@@ -194,12 +204,11 @@ def _sample_with_callback(
     )
 
 
-def _with_length(measured: Sample, state: State) -> Sample:
+def _with_length(measured: Sample) -> Sample:
     """The sample with the status ``short_sample`` in its last block where it is short, see
     ``correlation_strain``.
     """
-    correlation_strain = sampled_correlation_strain(measured, state.grains)
-    of_length = length_status(measured.strain, correlation_strain)
+    of_length = length_status(measured.strain, measured.correlation_strain)
     status = jnp.asarray(measured.tally.status)
     worst = jnp.maximum(status[..., -1], jnp.asarray(of_length, status.dtype))
     return replace(measured, tally=replace(measured.tally, status=status.at[..., -1].set(worst)))

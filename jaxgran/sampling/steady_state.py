@@ -39,7 +39,6 @@ from jaxgran.model.status import GIVEN_UP, Status
 from jaxgran.sampling.blocks import Batch, shear_by_block
 from jaxgran.sampling.correlation_strain import (
     flow_correlation_strain,
-    sampled_correlation_strain,
     total_mass,
 )
 from jaxgran.sampling.drift import is_level, is_level_noise
@@ -140,8 +139,9 @@ def prepare_batch(
     """
     theory = predicted(flow, grains)
     check_timestep(flow, theory, grains)
+    mass = 1.0 if grains is None else np.mean(grains.masses, axis=-1)
     expected = expected_temperature(
-        theory.granular_temperature, flow.packing_fraction, flow.shear_rate
+        theory.granular_temperature, flow.packing_fraction, flow.shear_rate, mass
     )
     temperature = expected.astype(theory.granular_temperature.dtype)
     state, packed = run_batch(heat_replica, (flow, keys, temperature, grains))
@@ -187,7 +187,7 @@ def _sheared(
 
 
 def _with_correlation_strain(batch: Batch, sample: Sample) -> Batch:
-    return batch._replace(correlation_strain=sampled_correlation_strain(sample, batch.state.grains))
+    return batch._replace(correlation_strain=sample.correlation_strain)
 
 
 def _until_steady(batch: Batch, advance: AdvanceBatch) -> Batch:

@@ -34,17 +34,18 @@ _SMALLEST_DISTANCE = 1e-3  # smallest distance to jamming that enters a bound, i
 
 
 def expected_temperature(
-    theory: ArrayLike, packing_fraction: ArrayLike, shear_rate: ArrayLike = 1.0
+    theory: ArrayLike,
+    packing_fraction: ArrayLike,
+    shear_rate: ArrayLike = 1.0,
+    mass: ArrayLike = 1.0,
 ) -> np.ndarray:
     """Granular temperature of a flow in mσ²/t²: that of kinetic theory and a term from the geometry
-    of dense packings.
+    of dense packings, for grains of this mean mass in m.
 
     It is within a factor of two of simulations for 0 ≤ α ≤ 0.98 and 0.2 ≤ ν ≤ 0.83.
     """
-    return (
-        np.asarray(theory)
-        + 0.02 * np.asarray(shear_rate) ** 2 / distance_to_jamming(packing_fraction) ** 1.2
-    )
+    geometry = 0.02 * np.asarray(shear_rate) ** 2 / distance_to_jamming(packing_fraction) ** 1.2
+    return np.asarray(theory) + geometry * np.asarray(mass)
 
 
 def longest_timestep(
