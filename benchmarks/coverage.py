@@ -13,14 +13,19 @@ With an error, nine points are sampled until it is reached, 40 times by four see
 same is asked of these
 intervals: a sample that ends when its estimated error is small may be one that underestimates it.
 
+Short samples, of a strain of 2 to 50, are the parts of 64 long ones at nine points, with 64 grains:
+the truth is the value of all, and a deviation is divided as above.
+
     python -m benchmarks coverage           # about 6 minutes on a core
     python -m benchmarks coverage --error 0.05  # about 20 minutes on a core
+    python -m benchmarks coverage --short   # about 4 minutes on a core
     python -m benchmarks coverage --quick   # two flows of 64 grains, under a minute
 """
 
 import time
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -33,19 +38,24 @@ from jaxgran.dynamics.tally import Tally
 from jaxgran.maps.status_report import BadPoints
 from jaxgran.model.status import Status
 from jaxgran.sampling.averages import averages
-from jaxgran.sampling.correlation_strain import flow_correlation_strain
-from jaxgran.sampling.sample import BLOCKS, ERROR_OBSERVABLES
-from jaxgran.statistics import standard_errors
+from jaxgran.sampling.sample import BLOCKS, ERROR_OBSERVABLES, estimates
 
 OBSERVABLES = ("force_ratio", "pressure", "shear_stress", "granular_temperature")
 SEEDS = (1, 2, 4, 8)
 STRAINS = (2, 4, 6, 8)  # sampled, in correlation strains
 PREPARED = 5  # correlation strains before the sample
+SHEAR_RATE = 1.0
 PILOT = 4.0  # strain of the sample that gives the correlation strain of a flow
 NORMAL_QUANTILE = 1.96
 ERROR_PLANE = (0.2, 0.5, 0.8), (0.3, 0.6, 0.75)  # restitutions, packing fractions
 ERROR_SEEDS = 4
 HOLDS = (0.92, 0.98)  # accepted shares of intervals
+SHORT_GRAINS, SHORT_STRAINS = 64, (2, 5, 10, 20, 50)
+SHORT_FLOWS = (
+    *((0.9, 0.2), (0.6, 0.2), (0.3, 0.5), (0.9, 0.5), (0.1, 0.6)),
+    *((0.3, 0.7), (0.9, 0.7), (0.5, 0.8), (0.9, 0.8)),
+)
+BLOCKS_A_STRAIN = 16
 
 
 class Plan(NamedTuple):
@@ -63,10 +73,15 @@ FULL = Plan((*DILUTE, *DENSE), 256, 1e-3, 64)
 QUICK = Plan(((0.8, 0.6), (0.8, 0.8)), 64, 1e-3, 8)
 
 
-def run(output: Output, error: float | None = None) -> None:
-    """Judge the flows, print a table, and write ``coverage`` as JSON and PNG; or judge an error."""
+def run(output: Output, error: float | None = None, short: bool = False) -> None:
+    """Judge the flows, print a table, and write ``coverage`` as JSON; or judge an error, or short
+    samples.
+    """
     if error is not None:
         judge_error(output, error)
+        return
+    if short:
+        judge_short(output)
         return
     plan, rng, start = (
         QUICK if output.quick else FULL,
@@ -100,7 +115,7 @@ def flow_rows(plan: Plan, alpha: float, nu: float, rng: np.random.Generator) -> 
     """A row for every observable, sampled strain and number of seeds of one flow."""
     correlation_strain, samples = repeats(plan, alpha, nu)
     average = partial(
-        chosen_averages, area=samples.area[0], grains=plan.grains, shear_rate=samples.shear_rate[0]
+        chosen_averages, area=samples.area[0], grains=plan.grains, shear_rate=SHEAR_RATE
     )
     for strain in STRAINS:
         tally = in_blocks(samples.tally, strain)
@@ -110,7 +125,11 @@ def flow_rows(plan: Plan, alpha: float, nu: float, rng: np.random.Generator) -> 
             if 2 * seeds > plan.repeats:
                 continue
             groups = [group for _ in range(seeds) for group in divided(rng, plan.repeats, seeds)]
-            estimates = [standard_errors(average, picked(tally, group)) for group in groups]
+            parts = [
+                replace(samples[k], tally=jax.tree.map(lambda x, k=k: x[k], tally))
+                for k in range(plan.repeats)
+            ]
+            of_groups = [estimates([parts[k] for k in group]) for group in groups]
             head = {
                 "restitution": alpha,
                 "packing_fraction": nu,
@@ -119,7 +138,7 @@ def flow_rows(plan: Plan, alpha: float, nu: float, rng: np.random.Generator) -> 
             for observable in OBSERVABLES:
                 true = np.std(single[observable], ddof=1) / np.sqrt(seeds)
                 values, errors = np.array(
-                    [[part[observable] for part in pair] for pair in estimates]
+                    [[part[observable] for part in pair] for pair in of_groups]
                 ).T
                 deviations = (values - truth[observable]) / np.sqrt(1 - seeds / plan.repeats)
                 yield {
@@ -132,6 +151,56 @@ def flow_rows(plan: Plan, alpha: float, nu: float, rng: np.random.Generator) -> 
                     ),
                     "width": round(float(np.mean(errors / true)), 4),
                 }
+
+
+def judge_short(output: Output) -> None:
+    """Print how often the intervals of short samples hold, and write ``coverage_short``."""
+    count = 8 if output.quick else 64
+    strains = SHORT_STRAINS[: 2 if output.quick else None]
+    rows = []
+    for alpha, nu in SHORT_FLOWS:
+        flow = jg.ShearFlow(SHORT_GRAINS, alpha, nu, 1e-3)
+        states = jg.prepare(flow, jax.random.split(jax.random.key(64), count))
+        longest = strains[-1]
+        _, samples = jg.sample(flow, states, float(longest), BLOCKS_A_STRAIN * longest)
+        truth = averages(
+            samples.tally.total(axis=(0, 1)), samples.area[0], flow.grains, flow.shear_rate
+        )
+        for strain in strains:
+            parts = [part_of(samples[k], strain) for k in range(count)]
+            for name in ("force_ratio", "pressure"):
+                values = np.array([float(part.averages[name]) for part in parts])
+                errors = np.array([float(part.errors()[name]) for part in parts])
+                off = np.abs(values - float(truth[name])) / np.sqrt(1 - strain / longest / count)
+                rows.append(
+                    {
+                        "restitution": alpha,
+                        "packing_fraction": nu,
+                        "observable": name,
+                        "strain": strain,
+                        "correlation_strain": float(samples.correlation_strain.mean()),
+                        "covered": float(np.mean(off <= NORMAL_QUANTILE * errors)),
+                        "width": float(np.median(errors) / np.std(values, ddof=1)),
+                    }
+                )
+                print(
+                    "α {restitution:g}, ν {packing_fraction:g}, strain {strain}: {observable} "
+                    "{covered:.2f} / {width:.2f}".format(**rows[-1]),
+                    flush=True,
+                )
+    head = {"grains": SHORT_GRAINS, "repeats": count, "timestep": 1e-3}
+    output.write_rows("coverage_short", head, "rows", rows)
+
+
+def part_of(sample: jg.Sample, strain: int) -> jg.Sample:
+    """The beginning of a sample, in 32 blocks or a few more."""
+    merged = max(1, BLOCKS_A_STRAIN * strain // BLOCKS)
+    count = BLOCKS_A_STRAIN * strain // merged
+    tally = jax.tree.map(
+        lambda x: np.asarray(x)[: count * merged].reshape(count, merged, *x.shape[1:]),
+        sample.tally,
+    )
+    return replace(sample, tally=tally.total(axis=1))
 
 
 def judge_error(output: Output, error: float) -> None:
@@ -203,13 +272,10 @@ def judge_error(output: Output, error: float) -> None:
 def repeats(plan: Plan, alpha: float, nu: float) -> tuple[float, jg.Sample]:
     """Correlation strain of a flow, and its independent samples, with a leading axis of repeats."""
     flow = jg.ShearFlow(plan.grains, alpha, nu, plan.timestep)
-    state, pilot = jg.sample(
+    _, pilot = jg.sample(
         flow, jg.prepare(flow, jax.random.key(plan.repeats), equilibrate=10.0), PILOT
     )
-    mass = float(np.sum(state.grains.masses))
-    correlation_strain = float(
-        flow_correlation_strain(pilot.averages, plan.grains, mass, pilot.area, flow.shear_rate)
-    )
+    correlation_strain = float(pilot.correlation_strain)
     samples = []
     for seed in range(plan.repeats):
         state = jg.prepare(flow, jax.random.key(seed), equilibrate=PREPARED * correlation_strain)
@@ -227,10 +293,6 @@ def in_blocks(tally: Tally, strain: int) -> Tally:
         lambda x: x[:, : BLOCKS * merge].reshape(len(x), BLOCKS, merge, *x.shape[2:]), tally
     )
     return first.total(axis=2)
-
-
-def picked(tally: Tally, group: np.ndarray) -> Tally:
-    return jax.tree.map(lambda x: x[group], tally)
 
 
 def divided(rng: np.random.Generator, repeats: int, seeds: int) -> np.ndarray:

@@ -241,8 +241,9 @@ BENCHMARKS = (
         "coverage",
         "How often do 95 % intervals hold, against the sampled strain and the number of seeds?",
         (6, 0.5),
-        ("coverage.json", "coverage_error.json"),
+        ("coverage.json", "coverage_error.json", "coverage_short.json"),
         options=(
+            Option("--short", "judge samples of a strain of 2 to 50, of 64 grains", bool),
             Option(
                 "--error", "judge samples that end at this error, into coverage_error.json", float
             ),

@@ -243,6 +243,10 @@ PAIR = jg.ContactNetwork([[0, 1]], [[1.0, 0.0]], [1, 1], [-1])
 HALF, LAST = jnp.full(GRAINS, 0.5), np.append(np.ones(GRAINS - 1), 9.0)
 
 
+def sheared(**changes: Any) -> Any:
+    return jg.sample(flow(), replace(SEEN.state, **changes), 1.0)
+
+
 def map_of(**changes: Any) -> xr.Dataset:
     return jg.ratio_map(**{**MAP, "grains": GRAINS, **changes})
 
@@ -293,6 +297,25 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "key must be a random key": lambda: jg.prepare(flow(), jax.random.split(KEY, 0)),
     "at most 2147483647 time steps": lambda: jg.sample(flow(), SEEN.state, 1e30),
     "one State of 64 grains": lambda: jg.sample(make_flow("grains", 64), SEEN.state, 1.0),
+    # a state
+    "of velocities (32, 2), not (32, 3)": lambda: sheared(velocities=np.zeros((GRAINS, 3))),
+    "of tilt (), not (1,)": lambda: sheared(tilt=np.zeros(1)),
+    "only finite tilt": lambda: sheared(tilt=np.float64(np.inf)),
+    "only finite velocities": lambda: sheared(velocities=np.full((GRAINS, 2), np.nan)),
+    "only positive and finite side": lambda: sheared(side=np.float64(np.nan)),
+    "only positive and finite radii": lambda: sheared(grains=jg.Grains(-HALF, HALF)),
+    "only positive and finite masses": lambda: sheared(grains=jg.Grains(HALF, -HALF)),
+    "centres of grains 0 and 1 are 0 diameters apart": lambda: sheared(
+        positions=np.repeat(PLACES[0, ::2], 2, axis=0)
+    ),
+    "no total momentum": lambda: sheared(velocities=np.ones((GRAINS, 2))),
+    "packing_fraction must be 0.6, which the state has": lambda: jg.sample(
+        make_flow("packing_fraction", 0.5), SEEN.state, 1.0
+    ),
+    "its numbers are float32 and float64": lambda: sheared(tilt=np.float32(0)),
+    "its numbers are int64": lambda: jg.sample(
+        flow(), jax.tree.map(lambda x: np.asarray(x, int), SEEN.state), 1.0
+    ),
     "a whole number of 0 to 2147483647": lambda: jg.advance(flow(), SEEN.state, 2**31),
     "callback must be a function or None": lambda: jg.sample(
         flow(), SEEN.state, 1.0, callback="tell"

@@ -25,9 +25,9 @@ from jaxgran.sampling.averages import averages
 from jaxgran.sampling.blocks import Batch
 from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.observe import advance_batch
-from jaxgran.sampling.sample import BLOCKS, Sample
+from jaxgran.sampling.sample import BLOCKS, Sample, relative_error
 from jaxgran.sampling.sampler import _sample, check_precision, sample
-from jaxgran.sampling.steady_state import prepare_batch
+from jaxgran.sampling.steady_state import prepare, prepare_batch
 
 GRAINS, TIMESTEP, STRAIN = 64, 1e-2, 0.64
 FLOWS = [ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0.5, 0.9)]
@@ -209,3 +209,43 @@ def test_a_sample_below_four_correlation_strains_says_so_however_it_is_taken(sta
 def test_spread_of_the_largest_of_one_block_is_unknown() -> None:
     block = sample_of_tally(random_tally(np.random.default_rng(2), 1), FLOWS[0])
     assert np.isnan(block.errors()["max_overlap"]) and np.isnan(block.errors()["pressure"])
+
+
+def test_momentum_that_cannot_be_seen_before_is_a_status(state) -> None:
+    """What a check refuses of numbers, compiled code can only report."""
+    moving = replace(state, velocities=state.velocities + jnp.array([[0.0, 0.5]]))
+    with refused("no total momentum"):
+        sample(FLOWS[0], moving, 0.32)
+    compiled = jax.jit(lambda state: sample(FLOWS[0], state, 0.32)[1].status)
+    assert compiled(moving) == Status.not_steady
+    assert compiled(moving.without_momentum()) < Status.not_steady
+
+
+def test_a_force_ratio_without_a_cluster_has_the_error_of_those_it_may_have_missed() -> None:
+    """Of n collisions none is in a cluster: up to 3/n may be, the rule of three."""
+    tally = random_tally(np.random.default_rng(4), BLOCKS)
+    binary = replace(tally, impulse=tally.binary_impulse, contact_moment=tally.binary_moment)
+    measured = sample_of_tally(binary, FLOWS[0])
+    expected = 3 / 1.96 / tally.collisions.sum()
+    assert measured.errors()["force_ratio"] == pytest.approx(expected, rel=1e-12)
+    assert measured.errors()["stress_ratio"][0, 0] == pytest.approx(expected, rel=0.2)
+    assert np.isfinite(relative_error(measured))
+
+
+def test_intervals_of_samples_shorter_than_their_correlation_hold() -> None:
+    """64 windows of less than two correlation strains, out of one flow. Their errors are not far
+    too large either.
+    """
+    flow = ShearFlow(64, 0.9, 0.5, 1e-3)
+    state = prepare(flow, jax.random.key(5))
+    _, measured = sample(flow, state, 480.0, blocks=7680)
+    windows = jax.tree.map(lambda x: np.asarray(x).reshape(64, 120, *x.shape[1:]), measured.tally)
+    pressures, errors = [], []
+    for k in range(64):
+        window = replace(measured, tally=jax.tree.map(lambda x, k=k: x[k, :32], windows))
+        assert window.strain < 2 * window.correlation_strain
+        pressures.append(window.pressure)
+        errors.append(window.errors()["pressure"])
+    held = np.mean(np.abs(np.array(pressures) - measured.pressure) < 1.96 * np.array(errors))
+    assert held > 0.95 - 4 * np.sqrt(0.95 * 0.05 / 64)
+    assert np.median(errors) < 2 * np.std(pressures)

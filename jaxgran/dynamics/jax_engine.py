@@ -202,7 +202,9 @@ def count_events(
     """Steps that an advance by the engine ``Jax`` visits: the ``events`` that it needs in a loop of
     fixed length.
 
-    Arguments and errors are those of ``advance``.
+    They are those of these numbers only: with another restitution, as in an optimisation, an
+    advance may visit more. Leave room, such as half as many again; ``2 * steps + 1`` are always
+    enough. Arguments and errors are those of ``advance``.
     """
     require_advance(flow, state, steps)
     require_solver(solver)

@@ -95,6 +95,9 @@ def check_settings(settings: MapSettings) -> None:
         value, accepted = getattr(settings, row.name), row.metadata["option"].range
         if accepted is not None and value is not None and row.name not in settings.axes:
             require_number(row.name, value, *accepted)
+    if settings.equilibrate is None and max(settings.restitution) == 1:
+        reason = "must be below 1 unless `equilibrate` is given, as elastic grains only heat up"
+        raise refused("restitution", 1.0, reason)
     flows = settings.new_flows()
     _check_diameters(settings, flows)
     _check_part(settings, points)

@@ -31,7 +31,7 @@ from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.batch import run_batch
 from jaxgran.dynamics.engine import DEFAULT_NUMERICS, Engine, Numerics, checked_numerics
 from jaxgran.environment import usable_threads
-from jaxgran.model.checks import require_number
+from jaxgran.model.checks import require, require_number
 from jaxgran.model.flow import ShearFlow, require_sheared
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
@@ -91,10 +91,11 @@ def prepare(
       (replicas,) axis.
 
     Raises:
-      InputError: (a ValueError) the flow is not sheared, a grain of thermal speed would cross more
-        than a tenth of a diameter in one step, float32 positions cannot resolve the step, ``pack``
-        does not accept the grains, or the engine cannot do this. Or this function, which decides in
-        Python when a flow is steady, is called within ``jax.jit``, ``jax.vmap`` or a derivative.
+      InputError: (a ValueError) the flow is not sheared, elastic grains are to become steady, a
+        grain of thermal speed would cross more than a tenth of a diameter in one step, float32
+        positions cannot resolve the step, ``pack`` does not accept the grains, or the engine cannot
+        do this. Or this function, which decides in Python when a flow is steady, is called within
+        ``jax.jit``, ``jax.vmap`` or a derivative.
       RuntimeError: the flow, or one of the batch, did not become steady or ended with a bad status.
 
     Examples:
@@ -108,6 +109,10 @@ def prepare(
     if equilibrate is not None:
         words = "None or a number of at least 0 and at most 1e6"
         require_number("equilibrate", equilibrate, lambda x: (x >= 0) & (x <= 1e6), words)
+    else:
+        words = "below 1 where a steady state is wanted, as elastic grains only heat up: give "
+        words += "`equilibrate`, or begin with `jg.heated`"
+        require("restitution", flow.restitution, lambda x: x < 1, words)
     require_sheared(flow)
     numerics = checked_numerics(solver, engine)
     on_all_cores = partial(advance_batch, threads=usable_threads())
