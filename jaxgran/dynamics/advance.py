@@ -22,7 +22,7 @@ from jaxgran.dynamics.jax_engine import advance_by_jax, ended, require_advance
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
 from jaxgran.model.control_flow import in_batch
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.state import State, kinetic_energy
+from jaxgran.model.state import State, kinetic_energy, status_at_start
 
 
 def advance(
@@ -263,6 +263,7 @@ def call_numba(
         tolerance=solver.tolerance,
         activation=flow.activation,
         max_steps=solver.max_steps,
+        status=status_at_start(flow, state),
         resume_at=suspended,
     )
     shapes = [
