@@ -14,6 +14,7 @@ import pytest
 from flows import GRAINS, assert_same_bits, flow_of, replica, stacked
 from jax import export, lax
 from jax.sharding import Mesh, PartitionSpec
+from synthetic import refused
 
 import jaxgran as jg
 from jaxgran.dynamics import engine as engine_module
@@ -25,7 +26,7 @@ ENGINES = {"jax": jg.Jax(), "numba": jg.Numba()}
 
 @pytest.fixture(scope="module")
 def states(flowing) -> jg.State:
-    return stacked([flowing(0.7), flowing(0.75), flowing(0.7, 1)])
+    return stacked([flowing(0.7), flowing(0.7, 2), flowing(0.7, 1)])
 
 
 def compiled(function: Callable) -> Callable:
@@ -176,3 +177,18 @@ def test_a_sample_and_a_scan_advance_replicas_in_turn(states) -> None:
         together = compiled(jax.vmap(function))(ALPHAS, states)
         assert_same_bits(replica(together, 1), compiled(function)(ALPHAS[1], replica(states, 1)))
     assert states.positions.shape == (3, GRAINS, 2)
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_a_packing_fraction_is_that_of_the_state_alone(name: str, flowing) -> None:
+    """Under ``vmap`` another one ends its replica; a derivative, which would be zero, is refused."""
+
+    def end(nu: jax.Array) -> tuple[jax.Array, jax.Array]:
+        flow = replace(flow_of(0.7), packing_fraction=nu)
+        after, tally = advance(flow, flowing(0.7), jnp.int32(STEPS), engine=ENGINES[name])
+        return jnp.sum(after.velocities**2), tally.status
+
+    energy, status = jax.jit(jax.vmap(end))(jnp.array([0.69, 0.7]))
+    assert status.tolist() == [jg.Status.nonfinite, jg.Status.ok] and np.isfinite(energy[1])
+    with refused("packing_fraction must not be differentiated"):
+        jax.jit(jax.jacfwd(lambda nu: end(nu)[0]))(0.7)

@@ -1,20 +1,33 @@
 """The numba engine is the plain advance: same contacts, same impulses, same sums, same failures."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numba
 import numpy as np
 import pytest
-from flows import COUNTS, EXACT, GRAINS, assert_same_state, flow_of
+from flows import (
+    COUNTS,
+    EXACT,
+    GRAINS,
+    assert_same_bits,
+    assert_same_state,
+    flow_of,
+    replica,
+    stacked,
+)
+from fuzz_driver import GIVEN, of_numbers
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics import advance as advance_module
-from jaxgran.dynamics.engine import Jax, Numba
+from jaxgran.dynamics.engine import Jax, Numba, engine_named
 from jaxgran.dynamics.numba_engine import cluster_solver, layout
 from jaxgran.dynamics.numba_engine.ffi import object_file
 from jaxgran.dynamics.numba_engine.near_pairs import LIFE, closing_speed_bound, find_near_pairs
@@ -238,6 +251,38 @@ def test_senseless_states_come_to_an_end(
     )
     if not np.all(np.isfinite(after.velocities)):
         assert tally.status == Status.nonfinite
+
+
+def test_any_numbers_come_to_an_end_and_are_finite_or_flagged(engine) -> None:
+    """In a process of its own, which an index outside of its array would end by a signal."""
+    driver = Path(__file__).with_name("fuzz_driver.py")
+    command = [sys.executable, str(driver), engine]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_traced_number_that_cannot_be_ends_its_replica_and_no_other(engine) -> None:
+    cannot_be = {"timestep": 0.0, "shear_rate": -1.0, "side": -1.0, "radii": -0.5, "masses": -1.0}
+    faults = [
+        *((name, np.nan) for name in ("tilt", "restitution", "positions", *cannot_be)),
+        *((name, np.inf) for name in ("tilt", "restitution", "velocities", *cannot_be)),
+        *cannot_be.items(),
+    ]
+    replicas = [{name: np.array(x, float) for name, x in GIVEN.items()} for _ in (*faults, 0, 1)]
+    for changed, (name, value) in zip(replicas[1:-1], faults, strict=True):
+        changed[name].flat[0] = value
+
+    @jax.jit
+    @jax.vmap
+    def advanced(numbers):
+        flow, state = of_numbers(numbers)
+        return advance_module.advance(flow, state, jnp.int32(100), engine=engine_named(engine))
+
+    end, tally = advanced(stacked(replicas))
+    np.testing.assert_array_equal(tally.status[1:-1], Status.nonfinite)
+    first, last = ((replica(end, k), replica(tally, k)) for k in (0, -1))
+    assert_same_bits(first, last)
+    assert first[1].status == Status.ok and first[1].collisions > 0
 
 
 @settings(max_examples=200)

@@ -21,8 +21,8 @@ from jaxgran.dynamics.engine import Engine, Numba, Numerics, checked_numerics, s
 from jaxgran.dynamics.jax_engine import advance_by_jax, ended, require_advance
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
 from jaxgran.model.control_flow import in_batch
-from jaxgran.model.flow import ShearFlow
-from jaxgran.model.state import State, kinetic_energy
+from jaxgran.model.flow import ShearFlow, flow_of_state
+from jaxgran.model.state import State, kinetic_energy, status_at_start
 
 
 def advance(
@@ -83,7 +83,9 @@ def advance(
         "moving_contacts": moving_contacts,
     }
     option = " and ".join(name for name, given in options.items() if given)
-    if batch := checked_batch(require_advance, flow, state, steps):
+    batch = checked_batch(require_advance, flow, state, steps)
+    flow = flow_of_state(flow)
+    if batch:
 
         def advance_one(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
             return advance(
@@ -263,6 +265,7 @@ def call_numba(
         tolerance=solver.tolerance,
         activation=flow.activation,
         max_steps=solver.max_steps,
+        status=status_at_start(flow, state),
         resume_at=suspended,
     )
     shapes = [

@@ -15,7 +15,6 @@ does, to first order, with the values as they are. This is exact for collisions 
 a grain strikes a cluster, only the impulse that its own approach accounts for moves in time.
 """
 
-from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -183,12 +182,13 @@ def ended(
     """
     grains = state.grains
     end = State(grains, positions, velocities, state.side, tilt)
-    tally = sums.with_reading(readings(end)).tally(
+    finite = status_if_finite(positions, velocities, tilt)
+    read = sums.with_reading(readings(end))._replace(status=jnp.maximum(sums.status, finite))
+    tally = read.tally(
         energy_change=kinetic_energy(grains, velocities) - kinetic_energy(grains, state.velocities),
         momentum_drift=relative_momentum(grains, velocities),
     )
-    status = jnp.maximum(sums.status, status_if_finite(positions, velocities))
-    return end, replace(tally, status=status)
+    return end, tally
 
 
 def count_events(

@@ -52,7 +52,7 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.indexing import taken
 from jaxgran.model.reductions import largest, smallest
-from jaxgran.model.state import State, status_if_finite
+from jaxgran.model.state import State, status_at_start
 from jaxgran.model.status import Status
 
 LONGEST_FLIGHT = 0.05  # strain; a bound on the change of the peculiar velocities within one flight
@@ -92,7 +92,7 @@ class Carry(NamedTuple):
 def start(advance: Advance, state: State) -> Carry:
     """The carry before the first step, without lists."""
     lists, dtype = no_lists(state.positions, state.tilt), state.positions.dtype
-    sums = empty_sums(dtype)._replace(status=status_if_finite(state.positions, state.velocities))
+    sums = empty_sums(dtype)._replace(status=status_at_start(advance.flow, state))
     now = Carry(
         lists=lists,
         pairs=PairMotion(*4 * [jnp.zeros_like(lists.near.reach)]),

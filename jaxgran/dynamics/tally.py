@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 from jaxgran.contact.law import ContactTerms
 from jaxgran.model.batches import equal_values
 from jaxgran.model.indexing import taken
+from jaxgran.model.state import status_if_finite
 from jaxgran.model.status import DEEP_SHARE, Status, worse
 
 # What adds to a sum. The running sums of an engine stand in this order, and within it in the order
@@ -242,12 +243,14 @@ class RunningSums(NamedTuple):
         return self._replace(instant=instant, read_until=self.duration)
 
     def tally(self, **ends: Array) -> Tally:
-        """The tally.
+        """The tally; ``nonfinite`` if a sum is not finite.
 
         Args:
           ends: the sums that are known only at the end of an advance, by name, without the status.
         """
-        ends = {**ends, "status": self.status}
+        sums = self.flight, self.contact, self.solve, self.largest, self.instant
+        finite = status_if_finite(*sums, *ends.values())
+        ends = {**ends, "status": jnp.maximum(self.status, finite)}
         return Tally(**{name: ends[name] if name in ends else self._named(name) for name in TABLE})
 
     def _named(self, name: str) -> Array:

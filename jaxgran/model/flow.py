@@ -2,12 +2,14 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array
 
 from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.checks import (
@@ -242,6 +244,38 @@ def flow_of_replica(flow: Any, k: int, count: int) -> ShearFlow:
 def _require_flows(flow: Any) -> None:
     if not isinstance(flow, ShearFlow):
         raise InputError(f"flow must be a ShearFlow, not {short_repr(flow)}.")
+
+
+@jax.custom_jvp
+def _of_state(packing_fraction: Array) -> Array:
+    """A packing fraction that a state has."""
+    return packing_fraction
+
+
+@partial(_of_state.defjvp, symbolic_zeros=True)
+def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    if not isinstance(tangents[0], jax.custom_derivatives.SymbolicZero):
+        raise InputError(
+            "packing_fraction must not be differentiated, as it is that of the state, whose "
+            "derivative it would leave out: differentiate states of several packing fractions, or "
+            "hold it by jax.lax.stop_gradient(flow.packing_fraction)."
+        )
+    return primals[0], jnp.zeros_like(primals[0])
+
+
+def flow_of_state(flow: ShearFlow) -> ShearFlow:
+    """The flow of a state, which has the packing fraction: an InputError where JAX differentiates
+    with respect to that of the flow.
+    """
+    if not is_traced(flow.packing_fraction):
+        return flow
+    return _unflatten(
+        (flow.grains,),
+        (
+            _of_state(value) if name == "packing_fraction" else value
+            for name, value in ((name, getattr(flow, name)) for name in _TRACED_FIELDS)
+        ),
+    )
 
 
 def is_batch(flow: Any) -> bool:

@@ -1,6 +1,7 @@
 """State: a sheared packing at one instant, the check of a state, and its energy and momentum."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
@@ -195,8 +196,31 @@ def relative_momentum(grains: Grains, velocities: Array) -> Float[Array, ""]:
 
 
 def status_if_finite(*values: Array) -> Int[Array, ""]:
-    """``Status.ok`` if all numbers are finite, or else ``Status.nonfinite``; the values have one
-    shape.
+    """``Status.ok`` if all numbers are finite, or else ``Status.nonfinite``."""
+    return _nonfinite_unless(jnp.all(jnp.isfinite(x)) for x in values)
+
+
+def status_at_start(flow: ShearFlow, state: State) -> Int[Array, ""]:
+    """``Status.nonfinite`` unless an engine can advance a state: numbers are finite, radii, masses,
+    the side and the time step are positive, and the packing fraction is that of the flow.
+
+    Traced values are known in compiled code only.
     """
-    finite = jnp.all(jnp.isfinite(jnp.stack(values)))
-    return jnp.where(finite, Status.ok, Status.nonfinite).astype(jnp.int32)
+    packing_fraction = jnp.pi * jnp.sum(state.grains.radii**2) / state.side**2
+    numbers = jax.tree.leaves((flow, state))
+    positive = state.grains.radii, state.grains.masses, state.side, flow.timestep
+    return _nonfinite_unless(
+        jnp.all(x)
+        for x in (
+            *map(jnp.isfinite, numbers),
+            *(jnp.asarray(x) > 0 for x in positive),
+            jnp.asarray(flow.shear_rate) >= 0,
+            jnp.abs(packing_fraction - flow.packing_fraction) <= _ROUNDING,
+        )
+    )
+
+
+def _nonfinite_unless(conditions: Iterable[Array]) -> Int[Array, ""]:
+    """``Status.ok`` if all conditions hold, or else ``Status.nonfinite``."""
+    holds = jnp.all(jnp.stack([*conditions]))
+    return jnp.where(holds, Status.ok, Status.nonfinite).astype(jnp.int32)

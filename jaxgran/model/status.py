@@ -24,7 +24,7 @@ class Status(IntEnum):
     )
     infeasible = 6  # no impulses satisfy the contact law: the packing is jammed
     capacity = 7  # more pairs or contacts than the buffers hold
-    nonfinite = 8  # a position, velocity or impulse is not a finite number
+    nonfinite = 8  # a number is not finite, or the packing fraction is not that of the state
     failed = 9  # workers of a cluster died of it, and it was given up
 
 
@@ -54,7 +54,8 @@ MEANINGS = {
     "infeasible": "no impulses satisfy the contact law, the packing is jammed, lower the packing "
     "fraction",
     "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",
-    "nonfinite": "a position, velocity or impulse is not a finite number",
+    "nonfinite": "a number of the flow, its state or its sums is not finite, or the packing fraction "
+    "is not that of the state",
     "failed": "workers of a cluster died of it, perhaps for lack of memory; pass `resume=True` to "
     "try once more",
     "not_run": "the point was not run",

@@ -27,7 +27,13 @@ from jaxgran.model.checks import (
     short_repr,
     two_digits,
 )
-from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
+from jaxgran.model.flow import (
+    ShearFlow,
+    flow_of_state,
+    require_strain,
+    steps_of_blocks,
+    steps_of_strain,
+)
 from jaxgran.model.state import State, require_state
 from jaxgran.sampling.blocks import advance_by_block, sample_of_blocks
 from jaxgran.sampling.correlation_strain import length_status, total_mass
@@ -117,6 +123,7 @@ def sample(
     require("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
     check = partial(_require_sheared_state, blocks)
     batch = checked_batch(check, flow, state, strain)
+    flow = flow_of_state(flow)
     numerics = checked_numerics(solver, engine)
     for name, function in (("observe", observe), ("callback", callback)):
         if function is not None and not callable(function):

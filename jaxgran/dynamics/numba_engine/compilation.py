@@ -38,6 +38,15 @@ def _maximum(a, b):
     return a if a > b else b
 
 
+@inline_njit
+def whole_part(number, most):
+    """The whole part of a number, from 0 to ``most``, and 0 of NaN: an index must follow from a
+    number by this function, since the whole part of NaN or of a huge number may be anything.
+    """
+    positive = number if number > 0.0 else 0.0
+    return int(positive if positive < most else most)
+
+
 def _compiled(module: ModuleType) -> dict[str, Any]:
     """The functions of a module that is written for arrays of JAX, compiled for numbers from the
     same source where they are called.

@@ -19,6 +19,7 @@ NEW_POSITIONS, NEW_VELOCITIES, BLOCKS, MEMORY, RECORDS = range(5)
 class Inputs(NamedTuple):
     """Numbers of an advance, passed as one row of doubles in this order.
 
+    status: that of the state and the flow before the first step.
     resume_at: where an earlier call was suspended, ``BETWEEN_LISTS`` or ``WITHIN_LIST``; 0 to
     begin.
     """
@@ -31,6 +32,7 @@ class Inputs(NamedTuple):
     tolerance: Any
     activation: Any
     max_steps: Any
+    status: Any
     resume_at: Any
 
 

@@ -32,7 +32,7 @@ from jaxgran.dynamics.numba_engine.calendar import (
     predict_contact_steps,
 )
 from jaxgran.dynamics.numba_engine.collisions import collide, list_struck_pairs, strike
-from jaxgran.dynamics.numba_engine.compilation import CELL, njit
+from jaxgran.dynamics.numba_engine.compilation import CELL, njit, whole_part
 from jaxgran.dynamics.numba_engine.layout import (
     BETWEEN_LISTS,
     CAPACITY,
@@ -118,7 +118,7 @@ def advance_loop(
         inputs.activation,
         1.0 + inputs.restitution,
         inputs.tolerance,
-        int(inputs.max_steps),
+        whole_part(inputs.max_steps, MANY),
     )
     look_ahead, count = flow.activation * dt, radii.size
     blocks, all_steps = steps.size, 0
@@ -143,7 +143,8 @@ def advance_loop(
             positions, velocities, radii, masses, order.in_state, shear_rate, grains
         )
         # ``solved``: whether the contacts of the present step have been dealt with
-        steps_before_list, solved, status = 0, 0, OK if finite else NONFINITE
+        steps_before_list, solved = 0, 0
+        status = whole_part(inputs.status, FAILED) if finite else NONFINITE
         collisions_read = 0.0  # collisions until the last reading of the velocity scales
     widest_skin = side / 2 - largest_diameter  # nearest images are unique
     if widest_skin < 0.0:
@@ -213,9 +214,9 @@ def advance_loop(
             # the advance. A new list lasts to the next step, where it is renewed.
             list_steps = MANY
             if closing_speed > 0.0:
-                list_steps = min(slack / (closing_speed * dt), life / dt - k, MANY)
+                list_steps = min(slack / (closing_speed * dt), life / dt - k)
             contact_step, last_k = next_contact_step(entries, shift, pairs), k
-            list_end = last_k + int(max(list_steps, 1.0 if new_list else 0.0))
+            list_end = last_k + max(whole_part(list_steps, MANY), 1 if new_list else 0)
             k = min(list_end, contact_step, block_end - steps_before_list)
             flight, new_list = (k - last_k) * dt, False
             kinetic = add_flight(sums, k - last_k, flight, shear_rate * flight, kinetic)
@@ -273,7 +274,9 @@ def advance_loop(
             kinetic, max_speed, finite = strike(
                 touched_count, t, shear_rate, grains, network, clusters, kinetic, max_speed
             )
-            if not finite:
+            last_speed = closing_speed
+            closing_speed = closing_speed_bound(max_speed, shear_rate, largest_diameter + skin)
+            if not (finite and closing_speed < math.inf):
                 status = NONFINITE
                 break
             if sums[COLLISIONS] - collisions_read >= READ_AFTER * count / 2:
@@ -288,8 +291,6 @@ def advance_loop(
                     sums,
                 )
                 collisions_read = sums[COLLISIONS]
-            last_speed = closing_speed
-            closing_speed = closing_speed_bound(max_speed, shear_rate, largest_diameter + skin)
             slack -= (closing_speed - last_speed) * look_ahead
             horizon = max(min(slack / closing_speed, life - t), dt) + look_ahead
             listed = list_struck_pairs(

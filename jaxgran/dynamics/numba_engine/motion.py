@@ -2,7 +2,9 @@
 
 import math
 
-from jaxgran.dynamics.numba_engine.compilation import CELL, inline_njit, njit
+import numpy as np
+
+from jaxgran.dynamics.numba_engine.compilation import CELL, inline_njit, njit, whole_part
 from jaxgran.dynamics.numba_engine.layout import INVERSE_MASS, RADIUS, VX, VY, X, Y
 
 image_in_cell = CELL["image_in_cell"]
@@ -18,16 +20,16 @@ def put_in_order(positions, side, tilt, order):
     in_state, cells, starts, count = order.in_state, order.cells, order.starts, order.in_state.size
     across = 1
     if count > _CACHED_GRAINS:
-        across = int(max(1.0, min(math.sqrt(count), side / _ROW_HEIGHT)))
+        across = max(1, whole_part(side / _ROW_HEIGHT, math.sqrt(count)))
     for c in range(across * across + 1):
         starts[c] = 0
     for g in range(count):
         cells[g] = 0
-        if across > 1 and abs(positions[g, 0]) < math.inf and abs(positions[g, 1]) < math.inf:
-            row = min(max(int(positions[g, 1] / side * across), 0), across - 1)
+        if across > 1:
+            row = whole_part(positions[g, 1] / side * across, across - 1)
             fraction = (positions[g, 0] - tilt * positions[g, 1]) / side
-            column = int((fraction - math.floor(fraction)) * across)
-            cells[g] = row * across + min(max(column, 0), across - 1)
+            column = whole_part((fraction - np.floor(fraction)) * across, across - 1)
+            cells[g] = row * across + column
         starts[cells[g] + 1] += 1
     for c in range(across * across):
         starts[c + 1] += starts[c]
@@ -64,10 +66,10 @@ def bring_into_cell(grains, side, tilt, shear_rate):
     squared_speed = 0.0
     for g in range(motion.shape[0]):
         cx, cy = motion[g, VX] - shear_rate * motion[g, Y], motion[g, VY]
-        row = math.floor(motion[g, Y] / side)
+        row = np.floor(motion[g, Y] / side)
         motion[g, Y] -= row * side
         motion[g, X] -= row * tilt * side
-        motion[g, X] -= math.floor((motion[g, X] - tilt * motion[g, Y]) / side) * side
+        motion[g, X] -= np.floor((motion[g, X] - tilt * motion[g, Y]) / side) * side
         motion[g, VX] = cx + shear_rate * motion[g, Y]
         squared_speed = max(squared_speed, cx * cx + cy * cy)
     return math.sqrt(squared_speed)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.numba_engine.compilation import CELL, inline_njit, njit
+from jaxgran.dynamics.numba_engine.compilation import CELL, inline_njit, njit, whole_part
 from jaxgran.dynamics.numba_engine.layout import (
     FIRST,
     IMAGE_ROW,
@@ -55,8 +55,8 @@ def find_near_pairs(grains, pairs, side, tilt, reach, skin, capacity):
     are counted, not written.
     """
     most = math.sqrt(pairs.starts.size - 1)
-    rows = int(min(most, side / reach))
-    columns = int(min(most, side / (reach * math.sqrt(1.0 + tilt * tilt))))
+    rows = whole_part(side / reach, most)
+    columns = whole_part(side / (reach * math.sqrt(1.0 + tilt * tilt)), most)
     if rows >= 3 and columns >= 3:
         _sort_into_cells(grains, pairs, side, tilt, rows, columns)
         return _pairs_of_cells(pairs, side, tilt, rows, columns, skin, capacity)
@@ -73,9 +73,9 @@ def _sort_into_cells(grains, pairs, side, tilt, rows, columns):
     for cell in range(rows * columns + 1):
         starts[cell] = 0
     for g in range(motion.shape[0]):
-        row = min(max(int(motion[g, Y] / side * rows), 0), rows - 1)
+        row = whole_part(motion[g, Y] / side * rows, rows - 1)
         fraction = (motion[g, X] - tilt * motion[g, Y]) / side
-        cells[g] = row * columns + min(max(int(fraction * columns), 0), columns - 1)
+        cells[g] = row * columns + whole_part(fraction * columns, columns - 1)
         starts[cells[g] + 1] += 1
     for cell in range(rows * columns):
         starts[cell + 1] += starts[cell]

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.numba_engine.compilation import CELL, njit
+from jaxgran.dynamics.numba_engine.compilation import CELL, njit, whole_part
 from jaxgran.dynamics.numba_engine.layout import INVERSE_MASS, VX, VY, X, Y
 from jaxgran.dynamics.tally import place_of
 from jaxgran.dynamics.velocity_scales import BOX_GRAINS, WAVES
@@ -40,11 +40,12 @@ def read_velocity_scales(t, tilt, side, shear_rate, grains, boxes, amplitudes, r
         x, y = motion[g, X] + motion[g, VX] * t, motion[g, Y] + motion[g, VY] * t
         cx, cy, mass = motion[g, VX] - shear_rate * y, motion[g, VY], 1 / constants[g, INVERSE_MASS]
         sx, sy = (x - tilt * y) / side, y / side
-        sx, sy = sx - math.floor(sx), sy - math.floor(sy)
+        sx, sy = sx - np.floor(sx), sy - np.floor(sy)
         px, py = mass * cx, mass * cy
         energy += px * cx + py * cy
         total += mass
-        box = across * min(int(sy * across), across - 1) + min(int(sx * across), across - 1)
+        row, column = whole_part(sy * across, across - 1), whole_part(sx * across, across - 1)
+        box = across * row + column
         boxes[box, 0] += mass
         boxes[box, 1] += px
         boxes[box, 2] += py
