@@ -40,6 +40,12 @@ OF_THE_SOLVER = ("worst_residual", "complementarity", "iterations", "momentum_dr
 EXACT = BarzilaiBorwein(tolerance=1e-12, max_steps=100_000)  # contacts are solved to rounding
 
 
+def of_state(flow: ShearFlow, state: State) -> ShearFlow:
+    """The flow with the packing fraction of a state, as those of scenes of a few grains."""
+    area = np.pi * np.sum(np.square(state.grains.radii), axis=-1)
+    return replace(flow, packing_fraction=area / np.square(state.side))
+
+
 def flow_of(packing_fraction=0.6, **change) -> ShearFlow:
     """A flow of the shared number of grains."""
     numbers = {"restitution": 0.5, "timestep": 1e-3}
@@ -108,7 +114,9 @@ def run():
         solver: ProjectedMethod = EXACT,
     ):
         return jax.block_until_ready(
-            compiled(flow, solver, state, jnp.int32(steps), jnp.asarray(free_flight))
+            compiled(
+                of_state(flow, state), solver, state, jnp.int32(steps), jnp.asarray(free_flight)
+            )
         )
 
     return call
@@ -122,7 +130,9 @@ def engines(run):
         call = jax.jit(advance)
 
         def run(flow: ShearFlow, state: State, steps: int, solver: ProjectedMethod = EXACT):
-            return jax.block_until_ready(call(flow, solver, state, jnp.int32(steps)))
+            return jax.block_until_ready(
+                call(of_state(flow, state), solver, state, jnp.int32(steps))
+            )
 
         return run
 

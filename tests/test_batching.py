@@ -181,7 +181,7 @@ def test_a_sample_and_a_scan_advance_replicas_in_turn(states) -> None:
 
 @pytest.mark.parametrize("name", ENGINES)
 def test_a_packing_fraction_is_that_of_the_state_alone(name: str, flowing) -> None:
-    """Under ``vmap`` another one ends its replica; a derivative, which would be zero, is refused."""
+    """Another one ends its replica of ``vmap``; a derivative, which would be zero, is refused."""
 
     def end(nu: jax.Array) -> tuple[jax.Array, jax.Array]:
         flow = replace(flow_of(0.7), packing_fraction=nu)

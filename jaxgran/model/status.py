@@ -54,8 +54,8 @@ MEANINGS = {
     "infeasible": "no impulses satisfy the contact law, the packing is jammed, lower the packing "
     "fraction",
     "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",
-    "nonfinite": "a number of the flow, its state or its sums is not finite, or the packing fraction "
-    "is not that of the state",
+    "nonfinite": "a number of the flow, its state or its sums is not finite, or the packing "
+    "fraction is not that of the state",
     "failed": "workers of a cluster died of it, perhaps for lack of memory; pass `resume=True` to "
     "try once more",
     "not_run": "the point was not run",
