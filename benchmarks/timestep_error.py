@@ -1,5 +1,5 @@
 """What foretells the error of the pressure from the time step: over restitution and packing
-fraction, the pressure of time steps from 1e-2 to 3e-5, and what a sample itself knows of its step.
+fraction, the pressure of time steps from 1e-2 to 1e-4, and what a sample itself knows of its step.
 
 Each seed reaches its steady state at dt = 1e-3. From there the coarser time steps are sampled, then
 the finer ones in turn, each after a strain of two. The error is that against the finest step, with
@@ -43,12 +43,12 @@ class Plan(NamedTuple):
 
 
 FULL = Plan(
-    (0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95),
-    (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.78, 0.8, 0.82),
+    (0.1, 0.3, 0.5, 0.7, 0.9, 0.95),
+    (0.1, 0.3, 0.5, 0.6, 0.7, 0.75, 0.8, 0.82),
     256,
     4,
-    150.0,
-    (1e-2, 3.16e-3, 1e-3, 3.16e-4, 1e-4, 3.16e-5),
+    100.0,
+    (1e-2, 3.16e-3, 1e-3, 3.16e-4, 1e-4),
 )
 QUICK = Plan((0.9, 0.5), (0.8,), 64, 2, 10.0, (1e-2, 1e-3, 1e-4))
 
@@ -60,8 +60,10 @@ def run(output: Output) -> None:
     tasks = [(*flow, seed) for flow in flows for seed in range(plan.seeds)]
     dear_first = sorted(tasks, key=lambda task: (-task[0], task[1]))
     with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
-        parts = pool.map(samples, [plan] * len(tasks), dear_first)
-        done = dict(zip(dear_first, parts, strict=True))
+        parts, done = pool.map(samples, [plan] * len(tasks), dear_first), {}
+        for task, part in zip(dear_first, parts, strict=True):
+            done[task] = part
+            print("ν {:g}, α {:g}, seed {}".format(*task), flush=True)
     rows = []
     for nu, alpha in flows:
         seeds = [done[nu, alpha, seed] for seed in range(plan.seeds)]
