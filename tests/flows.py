@@ -42,8 +42,11 @@ EXACT = BarzilaiBorwein(tolerance=1e-12, max_steps=100_000)  # contacts are solv
 
 def of_state(flow: ShearFlow, state: State) -> ShearFlow:
     """The flow with the packing fraction of a state, as those of scenes of a few grains."""
-    area = np.pi * np.sum(np.square(state.grains.radii), axis=-1)
-    return replace(flow, packing_fraction=area / np.square(state.side))
+    with np.errstate(all="ignore"):
+        area = np.pi * np.sum(np.square(state.grains.radii), axis=-1)
+        packing_fraction = area / np.square(state.side)
+    accepted = np.all((packing_fraction > 0) & (packing_fraction <= 0.83))
+    return replace(flow, packing_fraction=packing_fraction) if accepted else flow
 
 
 def flow_of(packing_fraction=0.6, **change) -> ShearFlow:

@@ -48,7 +48,9 @@ def of_numbers(numbers: dict) -> tuple[ShearFlow, State]:
         *(numbers[name] for name in ("positions", "velocities", "side", "tilt")),
     )
     names = "restitution", "timestep", "shear_rate", "activation"
-    return replace(flow_of(), **{name: numbers[name] for name in names}), state
+    nu = jnp.pi * jnp.sum(numbers["radii"] ** 2) / numbers["side"] ** 2
+    changes = {"packing_fraction": nu, **{name: numbers[name] for name in names}}
+    return replace(flow_of(), **changes), state
 
 
 @jax.jit

@@ -18,6 +18,7 @@ from flows import (
     assert_same_bits,
     assert_same_state,
     flow_of,
+    of_state,
     replica,
     stacked,
 )
@@ -121,7 +122,7 @@ def test_results_do_not_depend_on_the_order_of_the_grains(rows) -> None:
         jnp.asarray(1.5 * rows),
         jnp.asarray(0.0),
     )
-    flow = ShearFlow(count, 0.9, 0.4, 1e-3)
+    flow = of_state(ShearFlow(count, 0.9, 0.4, 1e-3), state)
     advance = jax.jit(partial(advance_module.advance, solver=EXACT))
     shuffled = rng.permutation(count)
     after, tally = advance(flow, state, jnp.int32(100))
