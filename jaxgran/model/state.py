@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxgran.model.batches import Indexable, equal_values
-from jaxgran.model.checks import InputError, is_traced
+from jaxgran.model.checks import InputError, is_traced, require_native
 from jaxgran.model.display import are_numbers, rounded, text_of
 from jaxgran.model.flow import ShearFlow, require_flow
 from jaxgran.model.grains import Grains
@@ -98,6 +98,7 @@ def require_state(flow: ShearFlow, state: State) -> None:
             f"state must be of one precision, and its numbers are {' and '.join(precisions)}: "
             "jax.tree.map(lambda x: x.astype(float), state) makes them one."
         )
+    require_native("state", state)
 
 
 def require_match(flow: ShearFlow, state: State) -> None:

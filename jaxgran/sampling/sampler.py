@@ -219,6 +219,12 @@ def check_precision(flow: ShearFlow, state: State) -> None:
     if is_traced(flow.timestep, flow.shear_rate, state.side):
         return
     rounding = np.finfo(state.positions.dtype).eps * float(np.asarray(state.side).max())
+    slowest = np.finfo(state.positions.dtype).smallest_normal ** (1 / 3)
+    if (slow := float(np.min(np.asarray(flow.shear_rate, float)))) < slowest:
+        raise InputError(
+            f"shear_rate must be at least {two_digits(slowest, up=True)} in "
+            f"{state.positions.dtype}, not {slow:g}: its cube would underflow."
+        )
     least = _SMALLEST_MOTION * rounding
     if float(np.min(np.asarray(flow.timestep) * np.asarray(flow.shear_rate))) < least:
         raise InputError(
