@@ -65,7 +65,7 @@ def sample(
     ``observer``). A few instants are not enough for contact forces: at a short time step, most
     instants of a collisional flow have no contact with a force. A function of the forces, which are
     ``impulses / timestep``, is averaged exactly. Positions and velocities are observed once a free
-    flight; their averages are accurate up to the strain of a flight, about 1e-3.
+    flight, in its middle; their averages are accurate to second order in the strain of a flight.
 
     Args:
       flow: parameters of the state, with its packing fraction and polydispersity; or those
