@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxgran.model.batches import Indexable, equal_values
+from jaxgran.model.batches import Indexable, equal_values, in_numpy
 from jaxgran.model.checks import InputError, is_traced, require_native
 from jaxgran.model.display import are_numbers, rounded, text_of
 from jaxgran.model.flow import ShearFlow, require_flow
@@ -49,12 +49,10 @@ class State(Indexable):
         numbers = self.grains.radii, self.grains.masses, self.velocities, *cell.values()
         if not are_numbers(*numbers) or np.ndim(self.velocities) < 2:
             return text_of("State", {"positions": self.positions, **cell})
-        radii, masses, velocities, side, _ = map(np.asarray, numbers)
-        *replicas, grains, _ = velocities.shape
-        temperature = np.sum(masses[..., None] * velocities**2, axis=(-2, -1)) / (2 * grains)
+        *replicas, grains, _ = np.shape(self.velocities)
         values = {
-            "packing_fraction": np.sum(np.pi * radii**2, axis=-1) / side**2,
-            "granular_temperature": temperature,
+            "packing_fraction": self.packing_fraction,
+            "granular_temperature": self.granular_temperature,
             **cell,
         }
         return text_of(
@@ -63,9 +61,22 @@ class State(Indexable):
                 **({"replicas": math.prod(replicas)} if replicas else {}),
                 "grains": grains,
                 **{name: rounded(value) for name, value in values.items()},
-                "precision": str(velocities.dtype),
+                "precision": str(self.velocities.dtype),
             },
         )
+
+    @property
+    def packing_fraction(self) -> Float[Array | np.ndarray, ""]:
+        """Area of the grains over that of the cell, ν."""
+        state = in_numpy(self)
+        return (np.pi * state.grains.radii**2).sum(axis=-1) / state.side**2
+
+    @property
+    def granular_temperature(self) -> Float[Array | np.ndarray, ""]:
+        """Σ m c² / 2N, in mσ²/t²."""
+        state = in_numpy(self)
+        squares = (state.velocities**2).sum(axis=-1)
+        return (state.grains.masses * squares).sum(axis=-1) / (2 * squares.shape[-1])
 
     @property
     def _axes(self) -> tuple[int, ...]:
