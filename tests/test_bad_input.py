@@ -110,6 +110,9 @@ SIDE = np.sqrt(GRAINS * np.pi / 4 / 0.6)
 PLACES = np.stack(np.divmod(np.arange(GRAINS), 6), axis=-1)[None] * SIDE / 6  # of a lattice
 SEEN = jax.tree.map(lambda x: x[0], snapshot_of(PLACES, side=SIDE))
 POINT = np.zeros((1, 2))
+SWAPPED = jax.tree.map(lambda x: np.asarray(x).astype(">f8"), SEEN.state)
+SINGLE = jax.tree.map(lambda x: x.astype(jnp.float32), SEEN.state)
+SLOW = jg.ShearFlow(GRAINS, 0.5, 0.6, 1e-3 / 1e-20, shear_rate=1e-20)
 
 
 def flow() -> jg.ShearFlow:
@@ -207,6 +210,9 @@ def test_what_can_be_no_argument_is_refused_in_one_sentence(argument: str) -> No
 
 
 def test_lists_of_numbers_stand_for_arrays() -> None:
+    swapped = jg.ShearFlow(GRAINS, np.array([0, 0.5], ">f8"), np.array(0.6, ">f4"), 1e-3)
+    assert swapped == jg.ShearFlow(GRAINS, np.array([0, 0.5]), np.float32(0.6), 1e-3)
+    assert all(x.dtype.isnative for x in jax.tree.leaves(swapped))
     flows = jg.ShearFlow(GRAINS, [0, 0.5], (0.5, 0.6), 1e-3)
     assert flows == jg.ShearFlow(GRAINS, np.array([0.0, 0.5]), np.array([0.5, 0.6]), 1e-3)
     row = jg.DelassusProblem([[2, -1.0], [-1, 2]], [-1, 0])
@@ -275,7 +281,9 @@ REFUSED: dict[str, Callable[[], Any]] = {
     ),
     "timestep must be a positive number": lambda: make_flow("timestep", 0.0),
     "timestep must be at most 0.1 / shear_rate": lambda: make_flow("timestep", 0.2),
-    "shear_rate must be a number of at least 0": lambda: make_flow("shear_rate", -1e-9),
+    "shear_rate must be 0 or between 1e-100 and 1e+100": lambda: make_flow("shear_rate", -1e-9),
+    "between 1e-100 and 1e+100, not 1e-150": lambda: make_flow("shear_rate", 1e-150),
+    "and 1e+100, not 1e+150": lambda: jg.ShearFlow(GRAINS, 0.5, 0.6, 1e-153, shear_rate=1e150),
     "polydispersity must be between 0 and 0.5": lambda: make_flow("polydispersity", 0.51),
     "activation must be midpoint or touching": lambda: make_flow("activation", "Midpoint"),
     "arrays of one shape": lambda: jg.ShearFlow(GRAINS, np.zeros(2), np.full(3, 0.5), 1e-3),
@@ -295,6 +303,9 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "one ShearFlow, and this is a batch": lambda: jg.pack(BATCH, KEY),
     "numbers of the flow must be single ones or": lambda: jg.prepare(BATCH, KEY),
     "key must be a random key": lambda: jg.prepare(flow(), jax.random.split(KEY, 0)),
+    "state must have the byte order of this": lambda: jg.sample(flow(), SWAPPED, 1.0),
+    "grains must have the byte order of this": lambda: jg.pack(flow(), KEY, SWAPPED.grains),
+    "at least 2.3e-13 in float32, not 1e-20": lambda: jg.sample(SLOW, SINGLE, 1.0),
     "at most 2147483647 time steps": lambda: jg.sample(flow(), SEEN.state, 1e30),
     "one State of 64 grains": lambda: jg.sample(make_flow("grains", 64), SEEN.state, 1.0),
     # a state

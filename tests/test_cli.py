@@ -1,5 +1,6 @@
 """The command line does what it says, and says in one sentence what it cannot do."""
 
+import errno
 import json
 import os
 import re
@@ -37,6 +38,7 @@ from jaxgran.cli import app, options
 from jaxgran.cli import map as map_module
 from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
+from jaxgran.io import trajectory
 from jaxgran.io.trajectory import read_trajectory
 from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.results import open_map, write_dataset
@@ -284,6 +286,26 @@ def test_run_writes_frames_as_a_trajectory_and_as_a_movie(small_run) -> None:
     np.testing.assert_allclose(strain, 0.1 * np.arange(11), atol=0.51 * timestep)
     with Image.open(folder / "flow.gif") as film:
         assert film.n_frames == 11
+
+
+def test_a_disk_that_is_full_before_the_last_frame_leaves_the_trajectory_of_before(
+    tmp_path: Path, monkeypatch
+) -> None:
+    """An interruption keeps the frames that are whole."""
+    path, append = tmp_path / "flow.gsd", trajectory._append
+    for error, status in ((OSError(errno.ENOSPC, "No space left"), 1), (KeyboardInterrupt(), 130)):
+
+        def failing(file: Path, frame: Any, step: int, error=error) -> None:
+            if step > 0:
+                raise error
+            append(file, frame, step)
+
+        path.write_bytes(b"old")
+        monkeypatch.setattr(trajectory, "_append", failing)
+        outcome = jaxgran(tmp_path, *SMALL_RUN[:-2], *FRAMES, "--overwrite")
+        assert outcome.status == status and files(tmp_path) == {"flow.gsd"}
+        assert (path.read_bytes() == b"old") == (status == 1)
+    assert read_trajectory(path).step.tolist() == [0]
 
 
 def test_a_movie_has_forty_frames_and_can_be_sent_by_mail(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from jaxgran.analysis import fields as fields_module
 from jaxgran.analysis.fields import Fields, fields_at, grid
 from jaxgran.contact.network import Contacts
 from jaxgran.dynamics.snapshots import Snapshot, collided, flown, snapshot
-from jaxgran.model.cell import wrap
+from jaxgran.model.cell import displacement, wrap
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
@@ -304,6 +304,31 @@ def test_two_discs_that_collide_have_known_fields(scene) -> None:
     np.testing.assert_allclose(fields.dissipation, loss / 1e-3 * g, rtol=1e-10)
     np.testing.assert_allclose(fields.heat_flux, 0, atol=1e-9)
     np.testing.assert_allclose(densities(fields)[:, 3], g * (0.5**2 + 3**2 + 2**2), rtol=1e-10)
+
+
+@pytest.mark.parametrize("width", [0.25, 0.37])
+def test_temperature_has_nothing_of_the_mean_flow_whose_share_of_the_kinetic_stress_is_known(
+    seen, width: float
+) -> None:
+    """Grains that move with the mean flow are cold; others have the weighted variance of their
+    peculiar velocities.
+    """
+    still = replace(seen.state, velocities=jnp.zeros_like(seen.state.velocities))
+    points = grid(still.side, 24)
+    cold = flight_fields_at(still, points, width)
+    np.testing.assert_allclose(cold.temperature, 0, atol=1e-12)
+    xx = cold.kinetic_stress[:, 0, 0] + cold.density * (cold.velocity[:, 0] - points[:, 1]) ** 2
+    assert jnp.mean(xx) == pytest.approx(width**2 * float(jnp.mean(cold.density)), rel=1e-4)
+    drift = replace(seen.state, velocities=jnp.full_like(still.velocities, 3.0))
+    np.testing.assert_allclose(flight_fields_at(drift, points, width).temperature, 0, atol=1e-12)
+    point, state = points[7], seen.state
+    apart = displacement(point[None], state.positions, state.side, state.tilt)
+    weight = jnp.exp(-jnp.sum(apart**2, axis=1) / (2 * width**2))
+    mass, c = state.grains.masses * weight, state.velocities
+    mean = mass @ c / jnp.sum(mass)
+    expected = jnp.sum(mass[:, None] * (c - mean[None]) ** 2) / (2 * jnp.sum(weight))
+    hot = flight_fields_at(state, point[None], width).temperature
+    np.testing.assert_allclose(hot, expected, rtol=1e-9, atol=1e-12)
 
 
 def virial_stress(seen: Snapshot) -> np.ndarray:

@@ -58,6 +58,16 @@ def test_forces_of_a_state_act_between_grains_that_touch(with_states) -> None:
     assert pairs
 
 
+def test_forces_of_a_state_are_the_same_whatever_the_precision_of_the_session(with_states) -> None:
+    for point, state in first_of_points(with_states).items():
+        state = jax.tree.map(np.asarray, state)
+        flow = SETTINGS.restitution[point], 0.8, 5e-4, "midpoint"
+        with jax.enable_x64(False):
+            single = instant_at(state, *flow)
+        jax.tree.map(np.testing.assert_array_equal, single, instant_at(state, *flow))
+        assert single.force.dtype == np.float64 and single.force.size
+
+
 def test_bad_replicas_give_no_state(with_states) -> None:
     replicas = dict(with_states)
     replicas[0, 0] = replicas[0, 0]._replace(status=int(Status.nonfinite))

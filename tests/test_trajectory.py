@@ -33,6 +33,7 @@ from jaxgran.io.trajectory import (
 from jaxgran.model.cell import displacement
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.status import Status
 from jaxgran.sampling.recorder import Recorder
 
 TILTS = (-0.4, 0.0, 0.3)
@@ -118,12 +119,12 @@ def test_a_state_is_read_back_to_the_bit(seen, tmp_path: Path) -> None:
 
 
 def test_states_are_written_with_the_forces_between_them(flow, seen, tmp_path: Path) -> None:
-    path, strains = tmp_path / "flow.gsd", [0.5, 0.512, 0.53]
-    states = jax.tree.map(lambda *x: jnp.stack(x), *(one.state for one in seen.values()))
+    path, states = tmp_path / "flow.gsd", stack([one.state for one in seen.values()])
+    strains = 0.5 + states.tilt - states.tilt[0]
     write_trajectory(path, flow, states, strains, solver=EXACT)
     read = read_trajectory(path)
     assert_same_bits(read.state, states)
-    np.testing.assert_array_equal(read.step, [0, 12, 30])
+    np.testing.assert_array_equal(read.step, np.round((strains - 0.5) / 1e-3))
     write_frame(tmp_path / "one.gsd", seen[TILTS[0]], 0)
     for file in (path, tmp_path / "one.gsd"):
         with gsd.hoomd.open(file) as frames:
@@ -138,6 +139,39 @@ def test_states_are_written_with_the_forces_between_them(flow, seen, tmp_path: P
         with pytest.raises(InputError, match=f"^{words}"):
             write_trajectory(path, flow, wrong[0], wrong[1], overwrite=wrong[2])
     assert_same_bits(read_trajectory(path).state, states)
+
+
+def test_frames_that_contradict_flow_grains_or_strain_are_refused(
+    flow, seen, tmp_path: Path
+) -> None:
+    states = jax.tree.map(jnp.asarray, stack([one.state for one in seen.values()]))
+    strains, grains = 0.5 + states.tilt - states.tilt[0], states.grains
+    lost = replace(states, velocities=states.velocities.at[1, 0].set(jnp.nan))
+    swapped = replace(
+        states, grains=replace(grains, radii=grains.radii.at[1].set(grains.radii[1, ::-1]))
+    )
+    for words, given in {
+        "finite numbers, and state 1": (flow, lost, strains),
+        "have the same grains, and state 1": (flow, swapped, strains),
+        "packing_fraction must be 0.78": (replace(flow, packing_fraction=0.5), states, strains),
+        "strain must be that by which the cell is tilted": (flow, states, strains * 1.01),
+        "shear_rate must be above 0": (replace(flow, shear_rate=0.0), states, strains),
+    }.items():
+        with refused(words):
+            write_trajectory(tmp_path / "flow.gsd", *given)
+    with jax.enable_x64(False), refused("precision of JAX, which is now float32"):
+        write_trajectory(tmp_path / "flow.gsd", flow, jax.tree.map(np.asarray, states), strains)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_frame_whose_forces_were_not_found_says_so(flow, seen, tmp_path: Path) -> None:
+    path, few = tmp_path / "flow.gsd", replace(EXACT, max_steps=1)
+    states, strains = stack([seen[0.0].state]), [0.0]
+    with pytest.warns(UserWarning, match="not converged, status iteration_limit: some contact"):
+        write_trajectory(path, flow, states, strains, solver=few)
+    assert read_trajectory(path).status.tolist() == [Status.iteration_limit]
+    write_trajectory(path, flow, states, strains, solver=EXACT, overwrite=True)
+    assert read_trajectory(path).status.tolist() == [Status.ok]
 
 
 # Recording

@@ -52,7 +52,12 @@ class Fields:
     density         (points,)       m/σ²     ρ = Σ m G
     number_density  (points,)       1/σ²     Σ G
     velocity        (points, 2)     σ/t      V = Σ m v G / ρ; the mean flow γ̇ y x̂ where ρ = 0
-    kinetic_stress  (points, 2, 2)  m/t²     Σ m (v − V)(v − V) G
+    kinetic_stress  (points, 2, 2)  m/t²     Σ m (v − V)(v − V) G; with the mean flow across the
+                                             Gaussian, γ̇² w² ρ of xx where many grains are near
+    temperature     (points,)       mσ²/t²   T = Σ m |c − C|² G / (2 Σ G), with the peculiar
+                                             velocities c and C = Σ m c G / ρ: about the profile
+                                             C + γ̇ y x̂, linear around the point; 0 where no grain is
+                                             near
     contact_stress  (points, 2, 2)  m/t²     Σ σ F ∫G over the contacts; positive for pressure
     heat_flux       (points, 2)     mσ/t³    J_Q = ½ Σ m |v − V|² (v − V) G + Σ σ F·((v̄_i +
                                              v̄_j)/2 − V) ∫G, with v̄ the
@@ -67,6 +72,7 @@ class Fields:
     number_density: Float[Array, " points"]
     velocity: Float[Array, "points 2"]
     kinetic_stress: Float[Array, "points 2 2"]
+    temperature: Float[Array, " points"]
     contact_stress: Float[Array, "points 2 2"]
     heat_flux: Float[Array, "points 2"]
     dissipation: Float[Array, " points"]
@@ -77,14 +83,6 @@ class Fields:
     def stress(self) -> Float[Array, "points 2 2"]:
         """Stress Σ, kinetic and contact, in m/t²."""
         return self.kinetic_stress + self.contact_stress
-
-    @property
-    def temperature(self) -> Float[Array, " points"]:
-        """Granular temperature tr Σ_k / (2 Σ G), in mσ²/t², with Σ_k the kinetic stress; zero where
-        no grain is near.
-        """
-        number = jnp.where(self.number_density > 0, self.number_density, 1)
-        return jnp.trace(self.kinetic_stress, axis1=1, axis2=2) / (2 * number)
 
 
 def fields_at(snapshot: Snapshot, points: Float[Array, "points 2"], width: float | Array) -> Fields:
@@ -162,7 +160,7 @@ def _fields_at(snapshot: Snapshot, points: Array, width: Array) -> Fields:
         d = displacement(points[:, None], positions[None], side, tilt)
         g = jnp.exp(-jnp.sum(d**2, axis=2) / (2 * width**2)) / (2 * jnp.pi * width**2)
         ux = cx[None] - shear_rate * d[..., 1]
-        return jnp.stack([g, g * ux, g * ux**2, g * ux**3])
+        return jnp.stack([g, g * ux, g * ux**2, g * ux**3, g * cx[None], g * cx[None] ** 2])
 
     def of_branches(points: Array, middles: Array, normals: Array, lengths: Array) -> Array:
         d = displacement(points[:, None], middles[None], side, tilt)
@@ -177,11 +175,14 @@ def _fields_at(snapshot: Snapshot, points: Array, width: Array) -> Fields:
         """By moments of velocities u = c − γ̇ d_y x̂ relative to the mean flow at the point: so
         images at a separation d need no correction, and no digits cancel far from the origin.
         """
-        moments = _sums_nearby(of_grains, 4, points, grains, reach, side)
-        (rho, y, yy, yyy, number, loss), (x, xy, xyy, *_), (xx, xxy, *_), (xxx, *_) = moments
+        moments = _sums_nearby(of_grains, 6, points, grains, reach, side)
+        (rho, y, yy, yyy, number, loss), (x, xy, xyy, *_), (xx, xxy, *_), (xxx, *_) = moments[:4]
+        (cx, *_), (cxx, *_) = moments[4:]
         farther = reach + jnp.max(lengths) / 2
         transferred, by_height = _sums_nearby(of_branches, 2, points, pairs, farther, side)
-        u = jnp.stack([x, y], axis=1) / jnp.where(rho > 0, rho, 1)[:, None]
+        mass = jnp.where(rho > 0, rho, 1)
+        u = jnp.stack([x, y], axis=1) / mass[:, None]
+        peculiar = cxx + yy - (cx**2 + y**2) / mass
         second = jnp.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
         kinetic_stress = second - rho[:, None, None] * u[:, :, None] * u[:, None]
         contact_stress = transferred[:4].T.reshape(-1, 2, 2)
@@ -193,6 +194,7 @@ def _fields_at(snapshot: Snapshot, points: Array, width: Array) -> Fields:
             number_density=number,
             velocity=u + jnp.stack([shear_rate * points[:, 1], jnp.zeros_like(rho)], axis=1),
             kinetic_stress=kinetic_stress,
+            temperature=peculiar / (2 * jnp.where(number > 0, number, 1)),
             contact_stress=contact_stress,
             heat_flux=energy_flux.T - (xx + yy)[:, None] / 2 * u - worked,
             dissipation=loss,

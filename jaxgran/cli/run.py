@@ -1,7 +1,8 @@
 """The command ``run``: one flow, its averages, and its frames as a trajectory or movie."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -95,12 +96,13 @@ def simulate_flow(
         name = "force_strain" if frame_strain is None else "frame_strain"
         raise InputError(f"`{name}` requires `trajectory` or `movie`.", field=name)
     plane = {"restitution": (restitution,), "packing_fraction": (packing_fraction,)}
-    data, interrupted, written = run_map({**plane, **chosen, "record": record}, quiet)
+    with _complete_at_the_end(trajectory):
+        data, interrupted, written = run_map({**plane, **chosen, "record": record}, quiet)
     if not json and bool(data.force_ratio.notnull().any()):
         _print_averages(data, all)
         print_large_system(data)
     if recorder is not None and recorder.frames:
-        _write_frames(files, recorder.frames, film, quiet)
+        _write_frames(files, recorder, film, quiet)
     if json:
         print_json(entries(data.isel(packing_fraction=0, restitution=0)))
     output = chosen.get("output")
@@ -108,6 +110,27 @@ def simulate_flow(
 
 
 run_command = command(RUN_OPTIONS, simulate_flow, required=("restitution", "packing_fraction"))
+
+
+def _unfinished(trajectory: Path) -> Path:
+    """The name of a trajectory to which frames are appended."""
+    return trajectory.with_name(f"{trajectory.name}.unfinished")
+
+
+@contextmanager
+def _complete_at_the_end(trajectory: Path | None) -> Iterator[None]:
+    """A trajectory that the block has recorded gets its own name, also after an interruption; an
+    error, such as that of a full disk, leaves none.
+    """
+    try:
+        yield
+    except Exception:
+        if trajectory is not None:
+            _unfinished(trajectory).unlink(missing_ok=True)
+        raise
+    finally:
+        if trajectory is not None and _unfinished(trajectory).exists():
+            _unfinished(trajectory).replace(trajectory)
 
 
 def _recorded(files: Mapping[str, Path], chosen: Mapping[str, Any]) -> dict[str, Any]:
@@ -148,7 +171,7 @@ def _recorder(
     keep, film = [], Frames()
     if "trajectory" in files:
         check_trajectory(files["trajectory"])
-        keep.append(partial(write_frame, files["trajectory"]))
+        keep.append(partial(write_frame, _unfinished(files["trajectory"])))
     if "movie" in files:
         check_movie(files["movie"])
         keep.append(film.keep)
@@ -156,8 +179,9 @@ def _recorder(
     return Recorder(between, *keep, force_strain=averaged, most=enough), film
 
 
-def _write_frames(files: Mapping[str, Path], frames: int, film: Any, quiet: bool) -> None:
-    """Draw the movie, and say what was written."""
+def _write_frames(files: Mapping[str, Path], recorder: Any, film: Any, quiet: bool) -> None:
+    """Draw the movie, and say what was written, and whether it lacks forces."""
+    from jaxgran.io.trajectory import lost_forces
     from jaxgran.plotting.movie import write_movie
 
     if "movie" in files:
@@ -165,7 +189,10 @@ def _write_frames(files: Mapping[str, Path], frames: int, film: Any, quiet: bool
     if not quiet:
         say("recording splits the run at different steps: averages change within their errors.")
         for name, file in files.items():
-            say(f"wrote {file}: {frames if name == 'trajectory' else len(film)} frames")
+            frames = recorder.frames if name == "trajectory" else len(film)
+            say(f"wrote {file}: {frames} frames")
+    if recorder.status > 0:
+        say(lost_forces(recorder.status))
 
 
 def _print_averages(data, all: bool) -> None:

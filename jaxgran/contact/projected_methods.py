@@ -30,6 +30,7 @@ Birgin, Martínez and Raydan (2000) for projected spectral gradients.
 
 import json
 from dataclasses import dataclass, fields
+from inspect import isfunction
 from typing import Any, NamedTuple
 
 import jax
@@ -74,7 +75,8 @@ class ProjectedMethod:
     with ``metadata={"static": True}`` is static.
 
     Raises:
-      InputError: (a ValueError) a number is outside its range; traced numbers are not checked.
+      InputError: (a ValueError) a number is outside its range, where traced numbers are not
+        checked; or a subclass has another public method, which would never be called.
 
     Examples:
       Momentum of a constant share β, y = J + β (J − J_before), with t = 1:
@@ -94,6 +96,13 @@ class ProjectedMethod:
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
+        hooks = {name for name in vars(ProjectedMethod) if not name.startswith("_")}
+        for name, value in vars(cls).items():
+            if isfunction(value) and not name.startswith("_") and name not in hooks:
+                raise InputError(
+                    f"a ProjectedMethod overrides bound, init, propose or learn, and {name} of "
+                    f"{cls.__name__} would never be called; name a function of your own _{name}."
+                )
         _register(cls)
 
     def __post_init__(self) -> None:

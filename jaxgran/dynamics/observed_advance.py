@@ -23,6 +23,7 @@ from jaxgran.dynamics.advance import NumbaCall, call_numba, numba_memory
 from jaxgran.dynamics.engine import Jax, Numerics, select_engine
 from jaxgran.dynamics.jax_engine import ended, observe_by_jax
 from jaxgran.dynamics.observer import Observe, added, nothing_observed, without_contacts
+from jaxgran.dynamics.snapshots import flown
 from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
 from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow
@@ -119,13 +120,14 @@ def _recorded_jvp(observe: Observe, primals: tuple, tangents: tuple) -> tuple:
 
 
 def _with_records(
-    flow: ShearFlow, state: State, observe: Observe, user_sums: Any, call: NumbaCall, flown: Array
+    flow: ShearFlow, state: State, observe: Observe, user_sums: Any, call: NumbaCall, steps: Array
 ) -> Any:
-    """The user sums with what is found in the records of a call, up to the step ``flown``."""
+    """The user sums with what is found in the records of a call, up to the step ``steps``."""
     from jaxgran.dynamics.numba_engine import layout
 
     records, count = call.records, call.recorded
     dtype = records.dtype
+    timestep, shear_rate = (jnp.asarray(x, dtype) for x in (flow.timestep, flow.shear_rate))
     most = MOST_CONTACTS * flow.grains
     sizes = max(4, flow.grains // _FEW), most
 
@@ -152,12 +154,14 @@ def _with_records(
             state.grains, before.positions, before.velocities + kicks, state.side, before.tilt
         )
         until = jnp.where(
-            k + 1 < count, records[jnp.minimum(k + 1, len(records) - 1), layout.RECORD_STEP], flown
+            k + 1 < count, records[jnp.minimum(k + 1, len(records) - 1), layout.RECORD_STEP], steps
         )
         # The step whose contacts have acted, in this record or an earlier one, is no step of the
         # flight.
-        weight = jnp.maximum(until - record[layout.RECORD_STEP] - record[layout.RECORD_SOLVED], 0)
-        return added(sums, without_contacts(partial(observe, flow, after), dtype), weight)
+        flight, solved = until - record[layout.RECORD_STEP], record[layout.RECORD_SOLVED]
+        middle = flown(after, shear_rate, (flight + solved) / 2 * timestep)
+        weight = jnp.maximum(flight - solved, 0)
+        return added(sums, without_contacts(partial(observe, flow, middle), dtype), weight)
 
     return lax.fori_loop(0, count, with_record, user_sums)
 

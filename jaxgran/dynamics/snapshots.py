@@ -28,6 +28,7 @@ from jaxgran.dynamics.step import closing_speed_bound
 from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.cell import remap_tilt, wrap
 from jaxgran.model.checks import as_array, require, require_whole
+from jaxgran.model.display import are_numbers, text_of
 from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
 from jaxgran.model.state import State, require_state
 from jaxgran.model.status import Status
@@ -64,6 +65,21 @@ class Snapshot(Indexable):
 
     __eq__ = equal_values
     _whole = "a series"
+
+    def __repr__(self) -> str:
+        numbers = self.impulses, self.status, self.timestep, self.shear_rate, self.restitution
+        if not are_numbers(*numbers) or np.ndim(self.impulses) < 1:
+            return text_of("Snapshot", {"state": self.state})
+        return text_of(
+            "Snapshot",
+            {
+                **({"times": len(self)} if self._axes else {}),
+                "grains": np.shape(self.state.positions)[-2],
+                "loaded_contacts": np.sum(np.asarray(self.impulses) > 0, axis=-1),
+                **{n: getattr(self, n) for n in ("timestep", "shear_rate", "restitution")},
+                "status": Status(int(np.max(self.status))).name,
+            },
+        )
 
     @property
     def _axes(self) -> tuple[int, ...]:

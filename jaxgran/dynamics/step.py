@@ -44,7 +44,13 @@ from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.contact.solver import single_contact, solve
 from jaxgran.dynamics.contact_sums import impulses_of, sums_of_contacts
 from jaxgran.dynamics.moving_contacts import contact_delays, delayed_shift, displaced, is_binary
-from jaxgran.dynamics.observer import ObserveNow, nothing_observed, with_contacts, with_flight
+from jaxgran.dynamics.observer import (
+    ObserveNow,
+    middle_of_flight,
+    nothing_observed,
+    with_contacts,
+    with_flight,
+)
 from jaxgran.dynamics.tally import RunningSums, empty_sums
 from jaxgran.dynamics.velocity_scales import READ_AFTER, readings
 from jaxgran.model.control_flow import any_replica, switch_replica, where_active
@@ -202,22 +208,30 @@ def fly(advance: Advance, now: Carry, steps: Int[Array, ""]) -> Carry:
     """Exact free flight (SLLOD) over a number of steps: the laboratory velocities stay as they
     are.
     """
-    frame, shear_rate = now.lists.frame, advance.flow.shear_rate
+    shear_rate = advance.flow.shear_rate
     time = steps.astype(now.slack.dtype) * advance.flow.timestep
     sums = _with_flight(now.sums, now.velocities, advance.grains, steps, time, shear_rate)
-    observe_now = observer_of(advance, now)
-    if observe_now is not None:
+    if advance.observe is not None:
+        middle = middle_of_flight(sums.user_sums, steps) * advance.flow.timestep
+        observe_now = observer_of(advance, _moved(now, middle, shear_rate))
+        assert observe_now is not None
         sums = sums._replace(user_sums=with_flight(sums.user_sums, observe_now, steps))
-    cy = now.velocities[:, 1]
+    return _moved(now, time, shear_rate)._replace(
+        pairs=now.pairs.moved(time),
+        slack=now.slack - now.closing_speed * time,
+        step=now.step + steps,
+        sums=sums,
+    )
+
+
+def _moved(now: Carry, time: Array, shear_rate: float | Array) -> Carry:
+    """The grains and the cell after free flight."""
+    frame, cy = now.lists.frame, now.velocities[:, 1]
     dx, dy, cx = flight_of(now.velocities[:, 0], cy, frame.strain, time, shear_rate)
     displacements = frame.displacements + jnp.stack([dx, dy], axis=-1)
     return now._replace(
         lists=replace(now.lists, frame=Frame(displacements, frame.strain + shear_rate * time)),
-        pairs=now.pairs.moved(time),
-        slack=now.slack - now.closing_speed * time,
         velocities=jnp.stack([cx, cy], axis=-1),
-        step=now.step + steps,
-        sums=sums,
     )
 
 

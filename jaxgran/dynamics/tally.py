@@ -47,7 +47,10 @@ def _sum(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Tally:
-    """Sums over the steps of a sample of one replica; ``+`` joins two samples."""
+    """Sums over the steps of a sample of one replica; ``+`` joins two samples.
+
+    Averages, such as the pressure, also need the cell: ``sample`` returns them, with errors.
+    """
 
     duration: Float[Array, "*b"] = _sum(FLIGHT, "1/γ̇", "time")
     steps: Float[Array, "*b"] = _sum(
@@ -322,7 +325,7 @@ def _documentation() -> str:
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in rows
     ]
-    return "\n".join(["", "", border, lines[0], border, *lines[1:], border])
+    return "\n".join(["", border, lines[0], border, *lines[1:], border])
 
 
 Tally.__doc__ = (Tally.__doc__ or "") + _documentation()

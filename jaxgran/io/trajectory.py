@@ -10,23 +10,25 @@ chunk                          shape           unit    meaning
 configuration/step             (1,)            –       time steps since the first frame
 configuration/box              (6,)            σ, –    ℓ, ℓ, 0, tilt, 0, 0; two dimensions
 particles/position             (grains, 3)     σ       centres, in the box around the origin; z = 0
-particles/velocity             (grains, 3)     σγ̇      peculiar velocities c, before the contacts
+particles/velocity             (grains, 3)     σ/t     peculiar velocities c, before the contacts
                                                        act; in the laboratory c + γ̇ y x̂
 particles/diameter, /mass      (grains,)       σ, m    diameters and masses
 bonds/group                    (bonds, 2)      –       pairs i < j of grains in loaded contact in
                                                        the steps of ``force_strain``
-log/bonds/force                (bonds,)        mσγ̇²    their forces J/dt, mean over these steps
-log/particles/contact_force    (grains,)       mσγ̇²    sum of the forces of its bonds, by magnitude
+log/bonds/force                (bonds,)        mσ/t²   their forces J/dt, mean over these steps
+log/particles/contact_force    (grains,)       mσ/t²   sum of the forces of its bonds, by magnitude
 log/particles/cluster          (grains,)       –       number of its cluster, joined by bonds
 log/particles/cluster_size     (grains,)       –       grains of its cluster; 1 without bonds
 log/particles/exact_position   (grains, 2)     σ       positions of the state, in [0, ℓ)
-log/particles/exact_velocity   (grains, 2)     σγ̇      velocities of the state
+log/particles/exact_velocity   (grains, 2)     σ/t     velocities of the state
 log/particles/exact_radius     (grains,)       σ       radii; in the first frame only
 log/particles/exact_mass       (grains,)       m       masses; in the first frame only
 log/jaxgran/side, /tilt        (1,)            σ, –    side and tilt of the state
 log/jaxgran/strain             (1,)            –       strain since the first frame
 log/jaxgran/force_strain       (1,)            –       strain over which forces are averaged
-log/jaxgran/timestep           (1,)            1/γ̇     dt
+log/jaxgran/status             (1,)            –       worst ``Status`` of these steps; above 0,
+                                                       forces may be missing or not converged
+log/jaxgran/timestep           (1,)            t       dt
 log/jaxgran/shear_rate         (1,)            1/t     γ̇
 log/jaxgran/restitution        (1,)            –       α
 log/jaxgran/format_version     (1,)            –       other versions are refused
@@ -34,6 +36,7 @@ log/jaxgran/format_version     (1,)            –       other versions are refu
 """
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,6 +46,7 @@ import gsd.fl
 import gsd.hoomd
 import jax
 import numpy as np
+from jax.dtypes import canonicalize_dtype
 from jaxtyping import Float, Int
 
 from jaxgran.analysis.contacts import pair_forces
@@ -54,13 +58,14 @@ from jaxgran.dynamics.snapshots import Snapshot, snapshots_from
 from jaxgran.files import atomic_write, other_version
 from jaxgran.io.paths import require_place
 from jaxgran.model.batches import equal_values
-from jaxgran.model.cell import centred
+from jaxgran.model.cell import centred, remap_tilt
 from jaxgran.model.checks import InputError, refused, require_number, short_repr
-from jaxgran.model.flow import ShearFlow, steps_of_strain
+from jaxgran.model.flow import ShearFlow, require_sheared, steps_of_strain
 from jaxgran.model.grains import Grains
-from jaxgran.model.state import State, require_state
+from jaxgran.model.state import State, require_match, require_state
+from jaxgran.model.status import MEANINGS, Status
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Version of the chunks of jaxgran."""
 
 _SCHEMA_VERSION = [1, 4]  # gsd 5 writes 2.0 by default, which older versions of gsd reject
@@ -78,7 +83,9 @@ class Trajectory:
                                         act
     step              (frames,)  –      time steps since the first frame
     strain            (frames,)  –      strain since the first frame
-    timestep          ()         1/γ̇    dt
+    status            (frames,)  –      ``Status`` of the contact forces; above 0, some may be
+                                        missing or not converged
+    timestep          ()         t      dt
     shear_rate        ()         1/t    γ̇
     restitution       ()         –      α
     packing_fraction  ()         –      ν
@@ -90,6 +97,7 @@ class Trajectory:
     state: State
     step: Int[np.ndarray, " frames"]
     strain: Float[np.ndarray, " frames"]
+    status: Int[np.ndarray, " frames"]
     timestep: Float[np.ndarray, ""]
     shear_rate: Float[np.ndarray, ""]
     restitution: Float[np.ndarray, ""]
@@ -157,9 +165,14 @@ def write_trajectory(
       solver: solves the contacts of the time steps after each state.
 
     Raises:
-      InputError: (a ValueError) the file exists or cannot be written, the states have no leading
-        axis or do not fit the flow, the strain does not increase by at least one time step from
-        frame to frame, or a frame averages forces beyond the next one.
+      InputError: (a ValueError) the file exists or cannot be written; the states have no leading
+        axis, are not finite, have different grains or do not fit the flow; their tilts contradict
+        the strain, or it does not increase by at least one time step from frame to frame; or a
+        frame averages forces beyond the next one.
+
+    Warns:
+      UserWarning: contact forces of a frame are missing or not converged, see ``status`` of
+        ``Trajectory``.
     """
     path = _as_path(path)
     check_trajectory(path)
@@ -172,23 +185,67 @@ def write_trajectory(
             "states must have one leading axis of frames: stack them, or take those of "
             "snapshot_series."
         )
+    frames = [states[k] for k in range(len(states))]
+    for number, state in enumerate(frames):
+        _require_frame(flow, state, frames[0], number)
     strains = np.asarray(strain, np.float64)
-    if strains.shape != np.shape(states.side):
-        raise InputError(f"strain must have one number for each of the {len(states)} states.")
+    if strains.shape != (len(frames),):
+        raise InputError(f"strain must have one number for each of the {len(frames)} states.")
+    require_sheared(flow)
     steps = steps_of_strain(flow, strains - strains[0])
     if not np.all(np.diff(steps) >= 1):
         raise InputError("strain must increase by at least one time step from frame to frame.")
-    frames = [states[k] for k in range(len(states))]
-    for state in frames:
-        require_state(flow, state)
+    _require_tilts(states, strains, steps)
     numerics = checked_numerics(solver, None)
     least = float(np.min(np.diff(strains), initial=np.inf))
     if force_strain is not None:
         accepted = f"above 0 and at most the strain between frames, {least:g}"
         require_number("force_strain", force_strain, lambda x: (x > 0) & (x <= least), accepted)
+    worst = Status.ok
     with atomic_write(path) as temporary:
         for state, step in zip(frames, steps.astype(int).tolist(), strict=True):
-            _append(temporary, snapshots_from(flow, numerics, state, force_strain or 0.0), step)
+            frame = snapshots_from(flow, numerics, state, force_strain or 0.0)
+            worst = max(worst, np.max(frame.status))
+            _append(temporary, frame, step)
+    if worst > Status.ok:
+        warnings.warn(lost_forces(worst), stacklevel=2)
+
+
+def lost_forces(worst: int) -> str:
+    """What the worst status of all frames says about their contact forces, in a sentence."""
+    name = Status(worst).name
+    return f"forces of some frames are missing or not converged, status {name}: {MEANINGS[name]}."
+
+
+def _require_frame(flow: ShearFlow, state: State, first: State, number: int) -> None:
+    """Raise an InputError unless this is a finite state of the flow with the first one's grains."""
+    require_state(flow, state)
+    if not all(np.isfinite(x).all() for x in jax.tree.leaves(state)):
+        raise InputError(f"states must be finite numbers, and state {number} has others.")
+    require_match(flow, state)
+    if state.grains != first.grains:
+        raise InputError(
+            f"states must have the same grains, and state {number} has others than the first."
+        )
+    if canonicalize_dtype(state.positions.dtype) != state.positions.dtype:
+        raise InputError(
+            "states must be in the precision of JAX, which is now float32: turn on float64 "
+            '(jax.config.update("jax_enable_x64", True)).'
+        )
+
+
+def _require_tilts(states: State, strains: np.ndarray, steps: np.ndarray) -> None:
+    """Raise an InputError unless the cell is tilted from frame to frame by the strain, up to a time
+    step, as both are rounded to whole ones, and to the rounding of each step.
+    """
+    apart, count = np.diff(strains), np.diff(steps)
+    wrong = remap_tilt(np.diff(np.asarray(states.tilt, np.float64)) - apart)
+    allowed = 1.01 * apart / count + np.finfo(states.tilt.dtype).eps * count
+    if np.any(bad := np.abs(wrong) > allowed):
+        raise InputError(
+            "strain must be that by which the cell is tilted between the states: states "
+            f"{(k := int(np.argmax(bad)))} and {k + 1} differ by {wrong[k]:.3g} from it."
+        )
 
 
 def _as_path(path: str | os.PathLike) -> Path:
@@ -236,6 +293,7 @@ def _gsd_frame(snapshots: Any, step: int) -> Any:
         "jaxgran/tilt": [state.tilt],
         "jaxgran/strain": [step * strain_of_step],
         "jaxgran/force_strain": [len(snapshots) * strain_of_step],
+        "jaxgran/status": [np.max(snapshots.status)],
         "jaxgran/timestep": [first.timestep.astype(float)],
         "jaxgran/shear_rate": [first.shear_rate.astype(float)],
         "jaxgran/restitution": [first.restitution.astype(float)],
@@ -293,6 +351,7 @@ def _trajectory(frames: Sequence[gsd.hoomd.Frame]) -> Trajectory:
         state=State(Grains(radii, masses), positions, velocities, side, number("tilt")),
         step=np.array([frame.configuration.step for frame in frames]),
         strain=number("strain"),
+        status=number("status"),
         timestep=np.array(number("timestep")[0]),
         shear_rate=np.array(number("shear_rate")[0]),
         restitution=np.array(number("restitution")[0]),

@@ -92,12 +92,13 @@ def instant_at(
     activation: Activation,
 ) -> ForceNetwork | None:
     """The grains of a state, and the forces of the time step that begins with it, by the default
-    solver.
+    solver, in float64 also where JAX has another precision.
 
     None where contacts may be missing or have no solution.
     """
     flow = ShearFlow(
         len(state.grains.radii), restitution, packing_fraction, timestep, activation=activation
     )
-    last = _snapshot(flow, state)
+    with jax.enable_x64(True):
+        last = _snapshot(flow, state)
     return None if last.status >= Status.infeasible else force_network(last)

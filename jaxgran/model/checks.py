@@ -95,13 +95,15 @@ def require(name: str, value: Any, accepts: Callable, accepted: str) -> None:
 
 
 def as_array(values: Any) -> Any:
-    """A list or tuple of numbers, or of equally long ones, as an array of floats; any other value
-    unchanged.
+    """A list or tuple of numbers, or of equally long ones, as an array of floats; an array in the
+    byte order of this machine; any other value unchanged.
 
     Examples:
       >>> as_array([[1, 0], (0, 1)]).tolist(), as_array(["a"])
       ([[1.0, 0.0], [0.0, 1.0]], ['a'])
     """
+    if isinstance(values, np.ndarray):  # compiled functions of JAX misread another byte order
+        return values.astype(values.dtype.newbyteorder("="), copy=False)
     if not isinstance(values, (list, tuple)):
         return values
     if any(isinstance(x, (list, tuple)) for x in values):
@@ -115,6 +117,17 @@ def as_array(values: Any) -> Any:
         for x in values
     )
     return np.asarray(values, float) if numbers else values
+
+
+def require_native(name: str, tree: Any) -> None:
+    """Raise an InputError if an array is in another byte order than that of this machine."""
+    import jax
+
+    if not all(np.dtype(getattr(x, "dtype", float)).isnative for x in jax.tree.leaves(tree)):
+        raise InputError(
+            f"{name} must have the byte order of this machine: "
+            f"jax.tree.map(lambda x: x.astype(float), {name}) gives it."
+        )
 
 
 def require_number(name: str, value: Any, accepts: Callable, accepted: str) -> None:

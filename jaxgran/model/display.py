@@ -13,7 +13,8 @@ import numpy as np
 _LONGEST_REPR = 100  # characters of a value that is not a number
 _LEAST_SHOWN = 1e-6  # relative error; digits below it are not shown
 _TWO_DIGITS = 3.55  # an error that begins with less has two digits
-_SMALLEST_PLAIN, _LARGEST_ROUNDED = -4, 5  # powers of ten of numbers without an exponent
+# Powers of ten of numbers without an exponent; the second where the error is smaller
+_SMALLEST_PLAIN, _LARGEST_ROUNDED, _LARGEST_PLAIN = -4, 5, 9
 
 
 def text_of(title: str, values: Mapping[str, Any], errors: Mapping[str, Any] | None = None) -> str:
@@ -58,7 +59,7 @@ def with_error(value: float, error: float) -> str:
     digits, power = f"{error:.2e}".split("e")
     last = int(power) - (float(digits) < _TWO_DIGITS)  # power of ten of the last digit
     largest = math.floor(math.log10(max(abs(value), error)))
-    plain = _SMALLEST_PLAIN <= largest <= max(last, _LARGEST_ROUNDED)
+    plain = _SMALLEST_PLAIN <= largest <= min(max(last, _LARGEST_ROUNDED), _LARGEST_PLAIN)
     shared = 0 if plain or last <= 0 <= largest else largest  # power of ten behind the brackets
     value, error = (round(x, -last) / 10**shared for x in (value, error))
     places = max(0, shared - last)

@@ -30,6 +30,7 @@ from jaxgran.model.choices import (
 )
 from jaxgran.model.display import text_of
 
+_FASTEST = 1e100  # shear rate; the square and cube of it and of its inverse are finite in float64
 _THETA = {"midpoint": 0.5, "touching": 0.0}  # of the activation rules
 
 RANGES = {
@@ -39,7 +40,10 @@ RANGES = {
         f"above 0 and at most {MAX_PACKING_FRACTION}",
     ),
     "timestep": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
-    "shear_rate": (lambda x: (x >= 0) & np.isfinite(x), "a number of at least 0"),
+    "shear_rate": (
+        lambda x: (x == 0) | (x >= 1 / _FASTEST) & (x <= _FASTEST),
+        f"0 or between {1 / _FASTEST:g} and {_FASTEST:g}",
+    ),
     "polydispersity": (lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),
     "activation": (lambda x: (x == 0.5) | (x == 0), " or ".join(_THETA)),
 }
@@ -64,7 +68,8 @@ class ShearFlow(Indexable):
                                          before
     packing_fraction  –                  ν in (0, 0.83], area of the grains over area of the cell
     timestep          1/shear_rate = 1   dt, at most 0.1
-    shear_rate        1/time             γ̇ ≥ 0; 0 in free cooling, where the unit of time is free
+    shear_rate        1/time             γ̇, 1e-100 to 1e100; 0 in free cooling, where the unit of
+                                         time is free
     polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ; not used with
                                          ``own_grains``
     activation        –                  θ, the part of a step of free flight after which grains

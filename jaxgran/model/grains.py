@@ -16,6 +16,7 @@ from jaxgran.model.checks import (
     as_array,
     require,
     require_key,
+    require_native,
     require_number,
     require_whole,
     short_repr,
@@ -120,6 +121,7 @@ def require_grains(grains: Any, count: int) -> None:
     shapes = np.shape(grains.radii), np.shape(grains.masses)
     if shapes != ((count,), (count,)):
         raise InputError(f"{words} of shapes {shapes[0]} and {shapes[1]}.")
+    require_native("grains", grains)
     for name in ("radii", "masses"):
         require(name, getattr(grains, name), lambda x: (x > 0) & np.isfinite(x), _POSITIVE)
     if not isinstance(grains.radii, Tracer):

@@ -11,8 +11,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxgran.model.batches import Indexable, equal_values
-from jaxgran.model.checks import InputError, concrete_or_none
+from jaxgran.model.batches import Indexable, equal_values, in_numpy
+from jaxgran.model.checks import InputError, concrete_or_none, require_native
 from jaxgran.model.display import are_numbers, rounded, text_of
 from jaxgran.model.flow import ShearFlow, require_flow
 from jaxgran.model.grains import Grains
@@ -54,12 +54,10 @@ class State(Indexable):
         numbers = self.grains.radii, self.grains.masses, self.velocities, *cell.values()
         if not are_numbers(*numbers) or np.ndim(self.velocities) < 2:
             return text_of("State", {"positions": self.positions, **cell})
-        radii, masses, velocities, side, _ = map(np.asarray, numbers)
-        *replicas, grains, _ = velocities.shape
-        temperature = np.sum(masses[..., None] * velocities**2, axis=(-2, -1)) / (2 * grains)
+        *replicas, grains, _ = np.shape(self.velocities)
         values = {
-            "packing_fraction": np.sum(np.pi * radii**2, axis=-1) / side**2,
-            "granular_temperature": temperature,
+            "packing_fraction": self.packing_fraction,
+            "granular_temperature": self.granular_temperature,
             **cell,
         }
         return text_of(
@@ -68,7 +66,7 @@ class State(Indexable):
                 **({"replicas": math.prod(replicas)} if replicas else {}),
                 "grains": grains,
                 **{name: rounded(value) for name, value in values.items()},
-                "precision": str(velocities.dtype),
+                "precision": str(self.velocities.dtype),
             },
         )
 
@@ -86,6 +84,19 @@ class State(Indexable):
         momentum = (masses * self.velocities).sum(axis=-2, keepdims=True)
         mean = momentum / masses.sum(axis=-2, keepdims=True)
         return replace(self, velocities=self.velocities - mean)
+
+    @property
+    def packing_fraction(self) -> Float[Array | np.ndarray, ""]:
+        """Area of the grains over that of the cell, ν."""
+        state = in_numpy(self)
+        return (np.pi * state.grains.radii**2).sum(axis=-1) / state.side**2
+
+    @property
+    def granular_temperature(self) -> Float[Array | np.ndarray, ""]:
+        """Σ m c² / 2N, in mσ²/t²."""
+        state = in_numpy(self)
+        squares = (state.velocities**2).sum(axis=-1)
+        return (state.grains.masses * squares).sum(axis=-1) / (2 * squares.shape[-1])
 
     @property
     def _axes(self) -> tuple[int, ...]:
@@ -124,7 +135,7 @@ def require_state(flow: ShearFlow, state: State) -> None:
     if radii is None or side is None:
         return
     if (nu := concrete_or_none(flow.packing_fraction)) is not None:
-        of_state = float(np.pi * np.sum(np.square(radii, dtype=float)) / float(side) ** 2)
+        of_state = float(state.packing_fraction)
         if abs(of_state - nu) > _ROUNDING:
             raise InputError(
                 f"packing_fraction must be {of_state:.6g}, which the state has, not {nu:g}: a flow "
@@ -151,6 +162,7 @@ def _require_arrays(grains: int, arrays: dict[str, Any]) -> None:
             f"state must be of one precision, and its numbers are {' and '.join(precisions)}: "
             "jax.tree.map(lambda x: x.astype(float), state) makes them one."
         )
+    require_native("state", state)
 
 
 def _require_apart(radii: np.ndarray, positions: np.ndarray, side: float, tilt: float) -> None:
@@ -206,7 +218,6 @@ def status_at_start(flow: ShearFlow, state: State) -> Int[Array, ""]:
 
     Traced values are known in compiled code only.
     """
-    packing_fraction = jnp.pi * jnp.sum(state.grains.radii**2) / state.side**2
     numbers = jax.tree.leaves((flow, state))
     positive = state.grains.radii, state.grains.masses, state.side, flow.timestep
     return _nonfinite_unless(
@@ -215,7 +226,7 @@ def status_at_start(flow: ShearFlow, state: State) -> Int[Array, ""]:
             *map(jnp.isfinite, numbers),
             *(jnp.asarray(x) > 0 for x in positive),
             jnp.asarray(flow.shear_rate) >= 0,
-            jnp.abs(packing_fraction - flow.packing_fraction) <= _ROUNDING,
+            abs(state.packing_fraction - flow.packing_fraction) <= _ROUNDING,
         )
     )
 

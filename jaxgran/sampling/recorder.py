@@ -40,19 +40,21 @@ class Recorder:
         The frame is then the series of these snapshots, which begins at the frame. One time step or
         less for a single snapshot.
       most: number of frames after which no more are taken, or None for frames to the end.
+
+    ``frames`` counts them, and ``status`` is the worst of their statuses.
     """
 
     def __init__(
         self, every: float, *keep: Keep, force_strain: float = 0.0, most: int | None = None
     ):
         self.every, self.keep, self.force_strain, self.most = every, keep, force_strain, most
-        self.frames = self.steps = self._taken = 0
+        self.frames = self.steps = self._taken = self.status = 0
 
     def recording(self, advance: AdvanceBatch) -> AdvanceBatch:
         """The advance of a batch of one replica, recording frames; the first call starts a new
         series.
         """
-        self.frames = self.steps = self._taken = 0
+        self.frames = self.steps = self._taken = self.status = 0
         return partial(self._advance, advance)
 
     def _advance(
@@ -93,3 +95,4 @@ class Recorder:
         for keep in self.keep:
             keep(frame, self.steps)
         self.frames += 1
+        self.status = max(self.status, int(np.max(frame.status)))

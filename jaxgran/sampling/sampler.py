@@ -72,7 +72,7 @@ def sample(
     ``observer``). A few instants are not enough for contact forces: at a short time step, most
     instants of a collisional flow have no contact with a force. A function of the forces, which are
     ``impulses / timestep``, is averaged exactly. Positions and velocities are observed once a free
-    flight; their averages are accurate up to the strain of a flight, about 1e-3.
+    flight, in its middle; their averages are accurate to second order in the strain of a flight.
 
     Args:
       flow: parameters of the state, with its packing fraction; or those (replicas,) of a batch.
@@ -235,6 +235,12 @@ def check_precision(flow: ShearFlow, state: State) -> None:
     if is_traced(flow.timestep, flow.shear_rate, state.side):
         return
     rounding = np.finfo(state.positions.dtype).eps * float(np.asarray(state.side).max())
+    slowest = np.finfo(state.positions.dtype).smallest_normal ** (1 / 3)
+    if (slow := float(np.min(np.asarray(flow.shear_rate, float)))) < slowest:
+        raise InputError(
+            f"shear_rate must be at least {two_digits(slowest, up=True)} in "
+            f"{state.positions.dtype}, not {slow:g}: its cube would underflow."
+        )
     least = _SMALLEST_MOTION * rounding
     if float(np.min(np.asarray(flow.timestep) * np.asarray(flow.shear_rate))) < least:
         raise InputError(
