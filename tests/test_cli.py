@@ -31,10 +31,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from PIL import Image
-from synthetic import random_replica
+from synthetic import random_replica, refused
 
 from jaxgran.cli import app, options
 from jaxgran.cli import map as map_module
+from jaxgran.cli import run as run_module
 from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
 from jaxgran.io.trajectory import read_trajectory
@@ -90,6 +91,18 @@ def no_figures(monkeypatch) -> None:
 # Lists
 
 
+def test_a_force_strain_of_the_strain_between_frames_is_accepted(
+    tmp_path: Path, monkeypatch
+) -> None:
+    """0.007 is a hundredth of 0.7, whatever the last bit says."""
+    monkeypatch.setattr(run_module, "configured_jax", lambda: None)
+    file = {"trajectory": tmp_path / "flow.gsd"}
+    for tenths in range(1, 100):
+        run_module._recorder(file, tenths / 10, None, float(f"{tenths}e-3"))
+        with refused("at most the strain between frames"):
+            run_module._recorder(file, tenths / 10, None, 1.001 * tenths / 1000)
+
+
 def restitutions(text: str) -> tuple[float, ...]:
     return options.parse("restitution", map_module.MAP_OPTIONS["restitution"], text)
 
@@ -100,6 +113,13 @@ def test_range_includes_both_ends_and_has_equal_gaps(start: int, stop: int, coun
     assert len(numbers) == count
     assert (numbers[0], numbers[-1]) == (start / 100, stop / 100)
     np.testing.assert_allclose(np.diff(numbers), (stop - start) / 100 / (count - 1), atol=2e-12)
+
+
+def test_a_range_of_time_steps_has_equal_ratios() -> None:
+    row = map_module.MAP_OPTIONS["timestep"]
+    assert options.parse("timestep", row, "1e-5:1e-3:3") == (1e-5, 1e-4, 1e-3)
+    with pytest.raises(typer.BadParameter, match="must be auto"):
+        options.parse("timestep", row, "0:1e-3:3")
 
 
 # Mistakes

@@ -13,7 +13,7 @@ from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.results import is_finished, open_map, write_dataset
 from jaxgran.maps.schema import ERROR_SOURCES, flattened, path_of
-from jaxgran.maps.seeds import NOT_RUN
+from jaxgran.maps.seeds import NOT_RUN, worst_status
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.variables import VARIABLES
 from jaxgran.model.status import Status
@@ -192,6 +192,12 @@ def test_worst_status_wins_and_is_a_cf_flag(data) -> None:
             **{s.value: s.name for s in Status},
         }
         assert data[name].dtype == values.dtype
+
+
+def test_the_error_that_is_asked_for_is_that_of_all_seeds_together() -> None:
+    """One imprecise seed is none of the point, unless a point lacks it or has another fault."""
+    seeds = np.array([[Status.imprecise, 0], [Status.imprecise, NOT_RUN], [Status.imprecise, 5]])
+    assert worst_status(seeds).tolist() == [Status.ok, NOT_RUN, Status.deep_overlap]
 
 
 def test_replicas_that_were_given_up_have_failed(settings, results) -> None:

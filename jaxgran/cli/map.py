@@ -19,7 +19,7 @@ from jaxgran.cli.outcome import (
     told_how_to_resume,
 )
 from jaxgran.cli.output import JSON, print_json, print_table, print_text
-from jaxgran.cli.terminal import say_cache, say_written
+from jaxgran.cli.terminal import say, say_cache, say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.choices import HALF_INTERVAL, FileFormat
@@ -78,7 +78,8 @@ def run_map_command(
     pictures = []
     if not interrupted:
         with told_how_to_resume(output, finished=True):
-            pictures = draw_beside(data if whole else None, output, format, overwrite, existed)
+            to_draw = data if whole else None
+            pictures = draw_beside(to_draw, output, format, overwrite, existed, written)
     if json:
         print_json(entries(data))
     elif whole:
@@ -106,19 +107,23 @@ def require_new_figures(output: Path, format: FileFormat) -> None:
 
 
 def draw_beside(
-    data, output: Path, format: FileFormat, overwrite: bool, existed: bool
+    data, output: Path, format: FileFormat, overwrite: bool, existed: bool, written: bool
 ) -> list[Path]:
-    """Draw the figures of a map beside its file, none of a part, then remove those of a map that it
-    replaced.
+    """Draw the figures of a map beside its file, none of a part. Of a map that was there before,
+    remove the others with ``overwrite``, or else name them.
 
-    Files that are there are kept without ``overwrite``. The files drawn.
+    Figures that are there are kept if the file was not ``written``. The files drawn.
     """
-    from jaxgran.plotting.map_figures import remove_pictures, save_figures
+    from jaxgran.plotting.map_figures import pictures_beside, save_figures
 
-    stem = output.with_suffix("")
-    pictures = [] if data is None else save_figures(data, stem, format, overwrite=overwrite)
-    if overwrite and existed:
-        remove_pictures(output, but=pictures)
+    stem, renew = output.with_suffix(""), overwrite or written
+    pictures = [] if data is None else save_figures(data, stem, format, overwrite=renew)
+    if renew and existed:
+        for file in sorted(pictures_beside(output) - {*pictures}):
+            if overwrite:
+                file.unlink()
+            else:
+                say(f"{file} shows the map as it was before: draw it again by jaxgran plot.")
     return pictures
 
 

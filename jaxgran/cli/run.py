@@ -13,7 +13,7 @@ from jaxgran.cli.output import JSON, print_json, print_table
 from jaxgran.cli.terminal import configured_jax, say, with_progress
 from jaxgran.io.paths import require_absent
 from jaxgran.maps.options import Option
-from jaxgran.model.checks import InputError, require_number
+from jaxgran.model.checks import InputError, at_most, require_number
 from jaxgran.model.display import unit_text, with_error
 
 MOST_RECORDED = 100_000  # frames of a trajectory
@@ -140,11 +140,13 @@ def _recorder(
     accepted = f"at least {least:g}, for {most} frames, and at most the sampled strain, {strain:g}"
     if every is not None:
         require_number(
-            "frame_strain", every, lambda x: (x >= 0.99 * least) & (x <= strain), accepted
+            "frame_strain", every, lambda x: (x >= 0.99 * least) & at_most(x, strain), accepted
         )
     if force_strain is not None:
         accepted = f"above 0 and at most the strain between frames, {between:g}"
-        require_number("force_strain", force_strain, lambda x: (x > 0) & (x <= between), accepted)
+        require_number(
+            "force_strain", force_strain, lambda x: (x > 0) & at_most(x, between), accepted
+        )
     keep, film = [], Frames()
     if "trajectory" in files:
         check_trajectory(files["trajectory"])

@@ -55,7 +55,7 @@ from jaxgran.files import atomic_write, other_version
 from jaxgran.io.paths import require_place
 from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import centred
-from jaxgran.model.checks import InputError, refused, require_number, short_repr
+from jaxgran.model.checks import InputError, at_most, refused, require_number, short_repr
 from jaxgran.model.flow import ShearFlow, steps_of_strain
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State, require_state
@@ -185,7 +185,9 @@ def write_trajectory(
     least = float(np.min(np.diff(strains), initial=np.inf))
     if force_strain is not None:
         accepted = f"above 0 and at most the strain between frames, {least:g}"
-        require_number("force_strain", force_strain, lambda x: (x > 0) & (x <= least), accepted)
+        require_number(
+            "force_strain", force_strain, lambda x: (x > 0) & at_most(x, least), accepted
+        )
     with atomic_write(path) as temporary:
         for state, step in zip(frames, steps.astype(int).tolist(), strict=True):
             _append(temporary, snapshots_from(flow, numerics, state, force_strain or 0.0), step)

@@ -31,6 +31,7 @@ class PointValues:
 
     settings: MapSettings
     replicas: Mapping[Key, Replica | None]
+    fewer_seeds: bool = False  # whether points may have fewer seeds than others
 
     @cached_property
     def grid(self) -> PointGrid:
@@ -48,9 +49,10 @@ class PointValues:
     @property
     def status(self) -> np.ndarray:
         """The worst of all seeds, and of their samples together."""
+        worst = worst_status(self.statuses, self.fewer_seeds)
         drifting = np.where(self.averages.drifting, Status.not_steady, NOT_RUN)
         imprecise = np.where(self._is_imprecise, Status.imprecise, NOT_RUN)
-        return np.maximum.reduce([worst_status(self.statuses), drifting, imprecise]).astype(np.int8)
+        return np.maximum.reduce([worst, drifting, imprecise]).astype(np.int8)
 
     @property
     def _is_imprecise(self) -> np.ndarray:

@@ -105,8 +105,8 @@ def ratio_map(
 
     With ``output``, finished replicas are kept in a folder beside it while the map runs. If
     ``resume`` is True, an unfinished map of the same parameters is continued, also with other axes,
-    seeds or part, and a finished one is read from its file; otherwise the former is an error. A
-    file with anything else is replaced only if ``overwrite`` is True. ``save_figures`` draws the
+    seeds or part, and a finished one is read from its file, if it is of this version; otherwise
+    both are errors. A file is replaced only if ``overwrite`` is True. ``save_figures`` draws the
     figures of ``jaxgran map``, and ``open_map`` reads the file.
 
     Args:
