@@ -520,7 +520,7 @@ def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypa
     np.testing.assert_array_equal(data.status, [[NOT_RUN, Status.ok]])
     assert np.isnan(data.force_ratio[0, 0]) and np.isfinite(data.force_ratio[0, 1])
     command = "jaxgran map --restitution 0.5,0.9 --packing-fraction 0.6 --seeds 1 --output half.nc"
-    assert "1 points missing; finished points are saved" in outcome.err
+    assert "1 point missing; finished points are saved" in outcome.err
     assert outcome.err.rstrip().endswith(f"Continue: {command} --resume")
 
 

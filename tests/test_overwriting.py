@@ -141,7 +141,7 @@ def test_an_interrupted_map_does_not_replace_a_finished_one(
         outcome = jaxgran(tmp_path, *MAP, *words)
         assert outcome.status == 130
         assert (
-            "1 points missing; finished points are saved" in outcome.err
+            "1 point missing; finished points are saved" in outcome.err
             and "wrote" not in outcome.err
         )
         assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished

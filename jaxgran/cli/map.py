@@ -23,7 +23,7 @@ from jaxgran.cli.terminal import say, say_cache, say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.choices import HALF_INTERVAL, FileFormat
-from jaxgran.model.display import in_brackets
+from jaxgran.model.display import counted, in_brackets
 
 MAP_EXAMPLES = {
     "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two "
@@ -187,7 +187,7 @@ def _print_plane(data, values, halves, title: str) -> None:
         ]
         rows.append([f"{nu:g}", *cells])
     columns = ["ν", *(f"α = {x:g}" for x in data.restitution.values)]
-    about = "In brackets: 95 % half-width of the last digits."
+    about = "In brackets: 95 % half-width of the last digits; bars of figures are standard errors."
     mark = " *: bad status." if data.status.any() else ""
     print_table(f"{title}. {about}{mark}", columns, rows)
 
@@ -203,4 +203,4 @@ def _print_success_of_theory(data) -> None:
     if known := np.isfinite(error).sum():
         right = (abs(error) <= 0.1).sum()
         words = "Kinetic theory is within 10 % of the pressure of a large system at"
-        print_text(f"{words} {right} of {known} points.")
+        print_text(f"{words} {right} of {counted(known, 'point')}.")

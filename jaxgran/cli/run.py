@@ -14,7 +14,7 @@ from jaxgran.cli.terminal import configured_jax, say, with_progress
 from jaxgran.io.paths import require_absent
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, at_most, require_number
-from jaxgran.model.display import unit_text, with_error
+from jaxgran.model.display import counted, unit_text, with_error
 
 MOST_RECORDED = 100_000  # frames of a trajectory
 _RECORDED_STRAIN = 5.0  # sampled strain where frames are recorded and none is given
@@ -167,7 +167,8 @@ def _write_frames(files: Mapping[str, Path], frames: int, film: Any, quiet: bool
     if not quiet:
         say("recording splits the run at different steps: averages change within their errors.")
         for name, file in files.items():
-            say(f"wrote {file}: {frames if name == 'trajectory' else len(film)} frames")
+            count = frames if name == "trajectory" else len(film)
+            say(f"wrote {file}: {counted(count, 'frame')}")
 
 
 def _print_averages(data, all: bool) -> None:

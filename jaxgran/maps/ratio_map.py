@@ -40,6 +40,7 @@ from jaxgran.maps.store import Store, open_store, replica_count
 from jaxgran.maps.variables import COORDINATES, VARIABLES
 from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.choices import Activation
+from jaxgran.model.display import counted
 from jaxgran.sampling.observables import OBSERVABLES
 
 P = ParamSpec("P")
@@ -256,8 +257,8 @@ def _workers(run: RunOptions) -> int:
 def _tell_resumed(settings: MapSettings, run: RunOptions, checkpoint: Checkpoint) -> None:
     """Print how much of a map is done, and which files are damaged."""
     run.tell(
-        f"continued: {len(checkpoint.done)} of {replica_count(settings)} replicas are done, "
-        f"{len(checkpoint.interrupted)} batches under way."
+        f"continued: {len(checkpoint.done)} of {counted(replica_count(settings), 'replica')} done, "
+        f"{counted(len(checkpoint.interrupted), 'batch')} under way."
     )
     if checkpoint.damaged:
         run.tell(f"damaged and computed again: {', '.join(checkpoint.damaged)}.")
