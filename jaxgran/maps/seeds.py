@@ -28,12 +28,9 @@ def replica_statuses(settings: MapSettings, replicas: Mapping[Key, Replica | Non
 def worst_status(statuses: np.ndarray, fewer_seeds: bool = False) -> np.ndarray:
     """The worst status (points,) over the seeds; ``NOT_RUN`` if a seed is missing and the others
     are ok, or, where points may have fewer seeds than others, if all are missing.
-
-    An imprecise seed does not count, as it is the error of all seeds together that is requested.
     """
-    counted = np.where(statuses == Status.imprecise, Status.ok, statuses)
-    worst = counted.max(axis=1)
-    missing = (counted.min(axis=1) == NOT_RUN) & (not fewer_seeds)
+    worst = statuses.max(axis=1)
+    missing = (statuses.min(axis=1) == NOT_RUN) & (not fewer_seeds)
     return np.where(missing & (worst <= Status.ok), NOT_RUN, worst).astype(np.int8)
 
 
