@@ -146,7 +146,9 @@ MISTAKES = {  # one for each kind of option, check and file
     "where --restitution 0.7 --packing-fraction 0.9": "--packing-fraction must be between 0.1 and "
     "0.83",
     "draw": "No such command 'draw'",
-    "run --alpha 0.5": "No such option: --alpha",
+    "run --alpha 0.5": "No such option: --alpha (Possible options: --restitution)",
+    "where --nu=0.5": "No such option: --nu (Possible options: --packing-fraction)",
+    "map --dt 1e-3": "No such option: --dt (Possible options: --timestep)",
     "map --outptu map.nc": "No such option: --outptu (Possible options: --output)",
     "map --restitution 0.1 0.5 0.9": "unexpected extra argument(s) (0.5 0.9)",
     "map --quiet=3": "Option '--quiet' does not take a value",

@@ -3,6 +3,7 @@ dataset and a file.
 """
 
 import inspect
+import math
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +19,7 @@ import xarray as xr
 from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.engine import Engine, in_lockstep
 from jaxgran.environment import usable_cores
-from jaxgran.maps.automatic import chosen_settings, expected_costs
+from jaxgran.maps.automatic import chosen_settings, expected_costs, expected_seconds
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import Provenance
 from jaxgran.maps.dataset import map_dataset, run_attributes
@@ -190,7 +191,9 @@ def run_missing(settings: MapSettings, run: RunOptions, store: Store) -> Measure
     attributes: dict[str, Any] = {"workers": workers, "resumed_replicas": len(results)}
     made: Provenance = {}
     interruption = None
-    with progress(settings, expected_costs(settings), run.progress is not True) as meter:
+    costs, known = expected_costs(settings), not in_lockstep() and run.scheduler is None
+    expected = expected_seconds(settings, costs) / workers if known else math.inf
+    with progress(settings, costs, run.progress is not True, expected) as meter:
         meter.resumed(results)
 
         def report(advance: Advance) -> None:
