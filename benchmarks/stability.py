@@ -40,10 +40,14 @@ from benchmarks.peers.jaxgran_itself import discs_of
 from benchmarks.peers.problem import Flow, Stress, blocks_of, relative
 from benchmarks.peers.problem import averages as stress_means
 from jaxgran.contact.delassus import diagonal
+from jaxgran.dynamics.batch import stack
 from jaxgran.environment import usable_cores
+from jaxgran.model.choices import MAX_PACKING_FRACTION
 from jaxgran.model.status import DEEP_OVERLAP
 from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, empty_figure, styled
 from jaxgran.sampling.averages import averages
+from jaxgran.sampling.prediction import predicted
+from jaxgran.sampling.timestep import expected_temperature, longest_timestep
 
 JAMMED = 0.84
 FLOWS = (
@@ -359,9 +363,21 @@ def cells(rows: list[dict]) -> Iterator[tuple[float, float, str, float | None, s
         yield *key, coarsest, outcome
 
 
+def longest_accepted(alpha: float, nu: float) -> float:
+    """The longest time step that a map accepts of a flow, and none of one that is jammed."""
+    if nu > MAX_PACKING_FRACTION:
+        return 0.0
+    flow = stack([jg.ShearFlow(FULL.grains, alpha, nu, REFERENCE_TIMESTEP)])
+    theory = predicted(flow).granular_temperature
+    temperature = expected_temperature(theory, flow.packing_fraction, flow.shear_rate)
+    return longest_timestep(temperature, flow.packing_fraction, flow.activation).item()
+
+
 @styled
 def draw(rows: list[dict]) -> Figure:
-    """A table: methods by flows, the coarsest setting that is right, or what fails."""
+    """A table: methods by flows, the coarsest setting that is right, or what fails; in brackets
+    where a map refuses it.
+    """
     methods = [name for name in (*PEERS, *METHODS) if name in {row["method"] for row in rows}]
     flows = list(dict.fromkeys((row["alpha"], row["nu"]) for row in rows))
     figure = empty_figure(TWO_COLUMNS, 2.5)
@@ -372,7 +388,9 @@ def draw(rows: list[dict]) -> Figure:
             text, colour = OUTCOMES[outcome], "white" if outcome == "no_reference" else "#f4a582"
         else:
             text, colour = text_of(method, setting), shade_of(method, setting)
-            text += " *" * (outcome == "deep_overlap")
+            if method in METHODS and setting > longest_accepted(alpha, nu):
+                text = f"({text})"
+            text += "*" * (outcome == "deep_overlap")
         axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
         axes.text(x, y, text, ha="center", va="center", fontsize=SMALL_SIZE)
     axes.set(xlim=(-0.5, len(flows) - 0.5), ylim=(len(methods) - 0.5, -0.5))
@@ -384,9 +402,9 @@ def draw(rows: list[dict]) -> Figure:
     axes.spines[:].set_visible(False)
     axes.set_xlabel(
         r"numbers: $\mathrm{d}t$ in $1/\dot\gamma$; of soft discs $k$ in $m\dot\gamma^2$; "
-        "darker: a coarser one suffices; *: largest overlap above 0.01 σ\n"
-        "unsolved: solves end above the tolerance; "
-        "–: runs, with nothing to compare (rigid discs are jammed)",
+        "darker: a coarser one suffices; (): maps refuse it as too long\n"
+        "*: largest overlap above 0.01 σ; unsolved: solves end above the tolerance; "
+        "–: nothing to compare (jammed)",
         fontsize=SMALL_SIZE,
     )
     return figure

@@ -19,7 +19,7 @@ PAUSE = 0.04
 journal.SECONDS = 0.1  # so that its batches have journals
 batches.batch_size = lambda *_: 2
 # Drawing takes as long as such a map.
-figures: Any = SimpleNamespace(save_figures=lambda *_, **__: [], remove_pictures=lambda *_: None)
+figures: Any = SimpleNamespace(save_figures=lambda *_, **__: [], pictures_beside=lambda _: set())
 modules: dict[str, Any] = sys.modules
 modules["jaxgran.plotting.map_figures"] = figures
 advance_batch = run_replicas.advance_batch

@@ -404,7 +404,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "maps must be a list of at least one map or file": lambda: jg.merge_maps("map.nc"),
     # fields, figures, pages, files
     "is the last one of a series": lambda: jg.fields_at(SEVERAL, POINT, 1.0),
-    "positive and at most 0.456 in this cell": lambda: jg.fields_at(SEEN, POINT, 1e308),
+    "positive and at most 0.456007 in this cell": lambda: jg.fields_at(SEEN, POINT, 1e308),
     "it has no packing_fraction, restitution, force_": lambda: jg.ratio_curves(xr.Dataset()),
     "it has no pressure, shear_stress, stress_ratio, pressure_large_system": lambda: (
         jg.theory_errors(ratio_dataset())

@@ -14,6 +14,7 @@ from matplotlib.text import Text
 
 from benchmarks import output
 from benchmarks.draw import PICTURES
+from benchmarks.peers import front
 from benchmarks.reference_map import BETWEEN, DENSER, PLANE, reference_points
 from benchmarks.registry import BENCHMARKS
 from benchmarks.timestep_study import arrays
@@ -94,3 +95,11 @@ def test_points_of_the_reference_map_are_those_of_its_four_maps() -> None:
         assert points.point_seeds.sel(where) == source.attrs["seeds"]
     in_order = points.point_grains.values.ravel()
     np.testing.assert_array_equal(points.attrs["grains_by_point"], in_order)
+
+
+def test_a_program_that_was_left_out_is_not_said_to_fail() -> None:
+    flow = {"restitution": 0.8, "packing_fraction": 0.6, "discs": 256}
+    failed = [{"curve": name, "setting": 1.0, "failure": "x"} for name in ("LAMMPS", "jaxgran")]
+    assert "LAMMPS" not in front.table([flow | {"rows": failed[1:]}])
+    table = front.table([flow | {"rows": failed}])
+    assert "| LAMMPS | – | fails |" in table and "collapse" not in table

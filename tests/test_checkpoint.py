@@ -18,7 +18,7 @@ from jaxgran import files
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.engine import Jax
 from jaxgran.io.arrays import write_arrays
-from jaxgran.maps import checkpoint
+from jaxgran.maps import checkpoint, provenance
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.replica import Key, Replica, replica_ids
 from jaxgran.maps.settings import MapSettings
@@ -187,6 +187,26 @@ def test_a_map_of_other_sources_is_not_continued(output: Path, monkeypatch) -> N
     monkeypatch.setattr("jaxgran.maps.provenance.sources_digest", lambda: "other")
     with refused("has code_digest "):
         Checkpoint(output, SETTINGS, resume=True)
+
+
+def test_a_map_of_another_version_names_it_and_its_commit_and_not_to_remove_it(
+    output: Path, monkeypatch
+) -> None:
+    older = provenance.made_with() | {"version_jaxgran": "0.1.0", "commit": "abc1234"}
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "made_with", lambda: older)
+        cut_off(output)
+    with pytest.raises(InputError) as caught:
+        Checkpoint(output, SETTINGS, resume=True)
+    assert "was begun by jaxgran 0.1.0, commit abc1234, and this is" in str(caught.value)
+    assert "resume it there" in str(caught.value) and "remove" not in str(caught.value)
+
+
+def test_workers_with_another_working_folder_find_the_journals(output: Path, monkeypatch) -> None:
+    monkeypatch.chdir(output.parent)
+    run = Checkpoint(Path(output.name), SETTINGS, resume=False)
+    assert run.journal_path([(0, 0)]).parent == output.with_name("map.nc.unfinished")
+    run.close(finished=True)
 
 
 def test_a_journal_without_its_map_is_no_part_of_the_next_one(output: Path) -> None:

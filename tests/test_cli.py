@@ -32,10 +32,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from PIL import Image
-from synthetic import random_replica
+from synthetic import random_replica, refused
 
 from jaxgran.cli import app, options
 from jaxgran.cli import map as map_module
+from jaxgran.cli import run as run_module
 from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
 from jaxgran.io import trajectory
@@ -92,6 +93,18 @@ def no_figures(monkeypatch) -> None:
 # Lists
 
 
+def test_a_force_strain_of_the_strain_between_frames_is_accepted(
+    tmp_path: Path, monkeypatch
+) -> None:
+    """0.007 is a hundredth of 0.7, whatever the last bit says."""
+    monkeypatch.setattr(run_module, "configured_jax", lambda: None)
+    file = {"trajectory": tmp_path / "flow.gsd"}
+    for tenths in range(1, 100):
+        run_module._recorder(file, tenths / 10, None, float(f"{tenths}e-3"))
+        with refused("at most the strain between frames"):
+            run_module._recorder(file, tenths / 10, None, 1.001 * tenths / 1000)
+
+
 def restitutions(text: str) -> tuple[float, ...]:
     return options.parse("restitution", map_module.MAP_OPTIONS["restitution"], text)
 
@@ -102,6 +115,13 @@ def test_range_includes_both_ends_and_has_equal_gaps(start: int, stop: int, coun
     assert len(numbers) == count
     assert (numbers[0], numbers[-1]) == (start / 100, stop / 100)
     np.testing.assert_allclose(np.diff(numbers), (stop - start) / 100 / (count - 1), atol=2e-12)
+
+
+def test_a_range_of_time_steps_has_equal_ratios() -> None:
+    row = map_module.MAP_OPTIONS["timestep"]
+    assert options.parse("timestep", row, "1e-5:1e-3:3") == (1e-5, 1e-4, 1e-3)
+    with pytest.raises(typer.BadParameter, match="must be auto"):
+        options.parse("timestep", row, "0:1e-3:3")
 
 
 # Mistakes
@@ -128,7 +148,9 @@ MISTAKES = {  # one for each kind of option, check and file
     "where --restitution 0.7 --packing-fraction 0.9": "--packing-fraction must be between 0.1 and "
     "0.83",
     "draw": "No such command 'draw'",
-    "run --alpha 0.5": "No such option: --alpha",
+    "run --alpha 0.5": "No such option: --alpha (Possible options: --restitution)",
+    "where --nu=0.5": "No such option: --nu (Possible options: --packing-fraction)",
+    "map --dt 1e-3": "No such option: --dt (Possible options: --timestep)",
     "map --outptu map.nc": "No such option: --outptu (Possible options: --output)",
     "map --restitution 0.1 0.5 0.9": "unexpected extra argument(s) (0.5 0.9)",
     "map --quiet=3": "Option '--quiet' does not take a value",
@@ -522,7 +544,7 @@ def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypa
     np.testing.assert_array_equal(data.status, [[NOT_RUN, Status.ok]])
     assert np.isnan(data.force_ratio[0, 0]) and np.isfinite(data.force_ratio[0, 1])
     command = "jaxgran map --restitution 0.5,0.9 --packing-fraction 0.6 --seeds 1 --output half.nc"
-    assert "1 points missing; finished points are saved" in outcome.err
+    assert "1 point missing; finished points are saved" in outcome.err
     assert outcome.err.rstrip().endswith(f"Continue: {command} --resume")
 
 

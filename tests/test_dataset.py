@@ -1,6 +1,7 @@
 """The dataset holds every promised name, survives the disc, and is never left half written."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from synthetic import random_replica, refused
 
 from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.dataset import map_dataset
+from jaxgran.maps.point_values import PointValues
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.results import is_finished, open_map, write_dataset
 from jaxgran.maps.schema import ERROR_SOURCES, flattened, path_of
@@ -20,7 +22,7 @@ from jaxgran.model.status import Status
 from jaxgran.sampling.budget import large_system, size_error
 from jaxgran.sampling.enskog_factors import FACTORS, LENGTHS, measured_over_enskog
 from jaxgran.sampling.observables import OBSERVABLES
-from jaxgran.sampling.sample import BLOCKS
+from jaxgran.sampling.sample import BLOCKS, ERROR_OBSERVABLES
 from jaxgran.theory.gaussian_moments import gaussian_moments
 
 ALPHAS, NUS, SEEDS = (0.5, 0.9), (0.5, 0.6), 3
@@ -192,6 +194,17 @@ def test_worst_status_wins_and_is_a_cf_flag(data) -> None:
             **{s.value: s.name for s in Status},
         }
         assert data[name].dtype == values.dtype
+
+
+def test_the_error_that_is_asked_for_is_that_of_all_seeds_together() -> None:
+    """One imprecise seed is none of the point, unless another is missing or all are imprecise."""
+    settings = MapSettings((0.2, 0.5, 0.9), (0.6,), grains=64, seeds=2, error=0.1)
+    points = PointValues(settings, {})
+    imprecise = [[Status.imprecise, 0], [Status.imprecise, NOT_RUN], [Status.imprecise, 0]]
+    half = SimpleNamespace(total=np.array([0.05, 0.05, 0.2]), value=np.ones(3))
+    points.__dict__["statuses"] = np.array(imprecise)
+    points.__dict__["large_system"] = dict.fromkeys(ERROR_OBSERVABLES, half)
+    assert points.status.tolist() == [Status.ok, NOT_RUN, Status.imprecise]
 
 
 def test_replicas_that_were_given_up_have_failed(settings, results) -> None:

@@ -102,6 +102,23 @@ def test_maps_of_other_seeds_make_the_map_of_all_seeds_with_the_scatter_between_
     )
 
 
+def test_seeds_of_a_number_that_carries_a_rounding_error_are_pooled_with_those_of_its_decimals(
+    replicas,
+) -> None:
+    first, second = of_seeds(replicas, 0, 1), of_seeds(replicas, 1, 2)
+    first.coords["restitution"] = [0.5, np.nextafter(0.7, 1), 0.9]
+    assert_one_run(merge_maps([first, second]), of_seeds(replicas, 0, 3))
+
+
+def test_a_point_of_fewer_seeds_than_others_is_measured(replicas) -> None:
+    good = {key: x for key, x in replicas.items() if key[0] >= 4}  # without a bad seed
+    more = of_axes(good, packing_fraction=(0.6,), restitution=(0.7,))
+    fewer = of_axes(good, packing_fraction=(0.6,), restitution=(0.9,), seeds=2)
+    merged = merge_maps([more, fewer])
+    assert np.isin(merged.status, [s.value for s in Status]).all()
+    assert (merged["sums"].status == -1).sum() == 1 and not bad_points(merged).get("not_run")
+
+
 def identifiers(data: xr.DataTree) -> list[ReplicaId]:
     """The replicas that a map has measured."""
     settings = MapSettings(**from_attrs(data))
@@ -114,7 +131,8 @@ def of_axes(replicas: dict[Key, Replica], **axes: Any) -> xr.DataTree:
     known = dict(zip(replica_ids(SETTINGS, replicas), replicas.values(), strict=True))
     keys = list(np.ndindex(len(settings.flows()), settings.seeds))
     names = zip(keys, replica_ids(settings, keys), strict=True)
-    return map_dataset(settings, {key: known[name] for key, name in names if name in known}, RUN)
+    measured = {key: known[name] for key, name in names if name in known}
+    return map_dataset(settings, measured, RUN, fewer_seeds=True)
 
 
 UNIONS: dict[str, Any] = {

@@ -98,16 +98,50 @@ def test_a_finished_map_is_taken_from_its_file_by_resume(
     assert_one_sentence(jaxgran(tmp_path, *MAP, "--resume", "--grains", "64"))
 
 
+def test_the_same_map_replaces_a_finished_one_only_where_that_is_said(
+    finished: bytes, tmp_path: Path
+) -> None:
+    assert_one_sentence(again := jaxgran(tmp_path, *MAP))
+    assert "already exists and has this map; pass --resume to keep its points" in again.err
+    assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
+    assert jaxgran(tmp_path, *MAP, "--overwrite").status == 0
+
+
+def test_a_finished_map_of_other_code_is_not_taken_for_one_of_this(
+    finished: bytes, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr("jaxgran.maps.provenance.sources_digest", lambda: "other")
+    assert_one_sentence(other := jaxgran(tmp_path, *MAP, "--resume"))
+    assert "--output 'jaxgran_map.nc' was made with jaxgran 0" in other.err
+    assert "it has code_digest " in other.err and "not 'other'" in other.err
+    assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
+    told = jaxgran(tmp_path, *MAP, "--resume", "--overwrite")
+    assert told.status == 0 and "wrote jaxgran_map.nc" in told.err
+
+
+def test_figures_are_those_of_the_data_that_a_command_wrote(tmp_path: Path, monkeypatch) -> None:
+    half = dict(list(BOTH.items())[:1])
+    with monkeypatch.context() as patch:
+        patch.setattr(ratio_map_module, "run_replicas", made_up_replicas(half, KeyboardInterrupt))
+        assert jaxgran(tmp_path, *MAP).status == 130
+    for name in ("curves.png", "curves.pdf"):
+        (tmp_path / f"jaxgran_map_{name}").write_bytes(b"of the half")
+    resumed = jaxgran(tmp_path, *MAP, "--resume")
+    assert resumed.status == 0 and "jaxgran_map_curves.pdf shows the map as it was" in resumed.err
+    assert (tmp_path / "jaxgran_map_curves.png").read_bytes() != b"of the half"
+    assert (tmp_path / "jaxgran_map_curves.pdf").read_bytes() == b"of the half"
+
+
 def test_an_interrupted_map_does_not_replace_a_finished_one(
     finished: bytes, tmp_path: Path, monkeypatch
 ) -> None:
     half = dict(list(BOTH.items())[:1])
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(half, KeyboardInterrupt))
-    for words in ([], ["--grains", "64", "--overwrite"]):
+    for words in (["--overwrite"], ["--grains", "64", "--overwrite"]):
         outcome = jaxgran(tmp_path, *MAP, *words)
         assert outcome.status == 130
         assert (
-            "1 points missing; finished points are saved" in outcome.err
+            "1 point missing; finished points are saved" in outcome.err
             and "wrote" not in outcome.err
         )
         assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
@@ -124,7 +158,7 @@ def test_plot_and_a_map_without_overwrite_remove_nothing(finished: bytes, tmp_pa
         (tmp_path / name).write_bytes(b"by hand")
     assert jaxgran(tmp_path, "plot", "jaxgran_map.nc", "--format", "pdf").status == 0
     assert jaxgran(tmp_path, *MAP, "--output", "other.nc").status == 0
-    assert jaxgran(tmp_path, *MAP).status == 0  # the same map once more
+    assert jaxgran(tmp_path, *MAP, "--resume").status == 0  # the same map once more
     assert {(tmp_path / name).read_bytes() for name in names} == {b"by hand"}
 
 

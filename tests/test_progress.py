@@ -1,5 +1,6 @@
 """Progress of a map: the share of its work that is done, and the time that the rest takes."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from jaxgran.maps.automatic import (
     chosen_settings,
     expected_correlation_strain,
     expected_costs,
+    expected_seconds,
     plans_of_sizes,
 )
 from jaxgran.maps.batches import predicted_cost, replica_cost
@@ -49,6 +51,16 @@ def test_a_map_whose_points_are_all_unfinished_has_done_a_part_of_its_work() -> 
     expected = (coarse + 2.5 * fine) / (coarse + 4.5 * fine)
     assert shares(meter) == ("0/2 points", f"{100 * expected:.0f} % of the work done")
     assert meter.done_steps == pytest.approx(4 * 26_000)
+
+
+def test_the_time_that_is_left_is_known_before_anything_is_done() -> None:
+    costs = expected_costs(SETTINGS)
+    seconds = expected_seconds(SETTINGS, costs)
+    meter = Meter(SETTINGS, costs, quiet=True, seconds=7200)
+    assert meter.first_line().endswith("about 2:00:00 expected")
+    assert "about 2:00:00 left" in meter._line()
+    one_seed = expected_seconds(replace(SETTINGS, seeds=1), costs)
+    assert 0 < seconds == pytest.approx(2 * one_seed)
 
 
 def test_work_before_a_replica_is_finished_counts_up_to_its_expected_cost() -> None:

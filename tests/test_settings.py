@@ -26,6 +26,7 @@ from jaxgran.maps.automatic import (
     sampling_targets,
 )
 from jaxgran.maps.presets import PRESETS
+from jaxgran.maps.replica import replica_ids
 from jaxgran.maps.settings import OPTIONS, MapSettings
 from jaxgran.maps.start import with_start
 from jaxgran.model.checks import InputError
@@ -213,3 +214,20 @@ def test_strain_and_time_of_a_plan_are_those_that_maps_took() -> None:
     )
     spent = data.attrs["workers"] * data.attrs["wall_time_seconds"]
     assert 1 / 3 < SECONDS * cost / spent < 3
+
+
+@pytest.mark.parametrize(
+    "lists",
+    [np.linspace(0.1, 0.9, 9), np.linspace(0.1, 0.9, 9, dtype=np.float32), [np.float32(0.3), 0.5]],
+    ids=["float64", "float32", "mixed"],
+)
+def test_the_numbers_of_an_axis_are_the_decimals_that_they_stand_for(lists: Any) -> None:
+    """0.30000000000000004 would be another point, of other random numbers, than 0.3."""
+    settings, _ = chosen(**{**GOOD, "restitution": lists, "timestep": 3 * (1e-3 / 10)})
+    assert settings.restitution == tuple(float(f"{x:.3g}") for x in lists)
+    assert 0.3 in {
+        x.restitution for x in replica_ids(settings, [(k, 0) for k in range(len(lists))])
+    }
+    assert settings.timestep == 3e-4
+    with refused("without repetition"):
+        chosen(**{**GOOD, "restitution": [0.3, 0.1 + 0.2]})

@@ -2,13 +2,17 @@
 refused.
 """
 
+from contextlib import nullcontext
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from synthetic import refused
 
 import jaxgran as jg
 from benchmarks import stability
+from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import DEEP_OVERLAP, Status
 
 
@@ -55,3 +59,18 @@ def test_parts_of_a_block_make_it_up() -> None:
     for steps in (1, 2, 100, 5000):
         assert sum(stability.pieces(steps)) == steps
         assert stability.pieces(steps)[0] <= max(1, steps // 1000)
+
+
+def test_a_time_step_that_maps_refuse_stands_in_brackets() -> None:
+    row = {
+        "alpha": 0.95,
+        "nu": 0.3,
+        "method": "default",
+        "outcome": "ok",
+        "errors": [[0, 0.01]] * 2,
+    }
+    for setting, shown in ((3e-3, r"($3\times10^{-3}$)"), (3e-4, r"$3\times10^{-4}$")):
+        with refused("timestep must be at most 7") if shown[0] == "(" else nullcontext():
+            MapSettings((0.95,), (0.3,), timestep=setting)
+        figure = stability.draw([row | {"setting": setting}])
+        assert shown in [text.get_text() for text in figure.axes[0].texts]

@@ -28,6 +28,7 @@ def test_a_table_fits_the_terminal_and_loses_nothing(width: int, monkeypatch) ->
     for _, *cells in MAP[2]:
         assert all(cell.split()[0][:4] in digits for cell in cells)
     assert text.count("±") == len(FRACTIONS) * len(RATIOS)
+    assert text.count(" ± 0.0019") == text.count("±")  # no number is broken
 
 
 def test_letters_that_a_terminal_lacks_are_written_in_others(monkeypatch) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from drawn import contour_lines, write_without_drawing
+from drawn import caption, contour_lines, write_without_drawing
 from made_up_maps import (
     STDERR,
     assumption_of,
@@ -118,6 +118,21 @@ def test_map_without_any_value_is_drawn(draw) -> None:
     figure = draw(empty)
     figure.canvas.draw()
     assert "no measured values" in [text.get_text() for text in figure.axes[0].texts]
+
+
+def test_captions_count_the_points_that_they_speak_of() -> None:
+    """Those with a value, in the panels; and what one point cannot show is not said."""
+    data = theory_dataset(5, 6)
+    shown = (data.restitution == 0.9) & (data.packing_fraction == 0.3)  # in all figures
+    few = data.where(shown).assign(status=data.status)
+    theory, factors, clusters = (
+        caption(draw(few)) for draw in (theory_errors, enskog_factors, cluster_shares)
+    )
+    assert "of 1 measured point, " in theory and "1 of which have" not in theory
+    assert "of 1 measured point, " in factors and "counted: 3 of 5 restitutions" in factors
+    assert "29 of 30 points without a value" in theory and "it grows" not in clusters
+    whole = caption(enskog_factors(data)), caption(cluster_shares(data))
+    assert "of 18 measured points" in whole[0] and "it grows with the excess" in whole[1]
 
 
 @pytest.mark.parametrize(

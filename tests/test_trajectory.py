@@ -151,7 +151,7 @@ def test_frames_that_contradict_flow_grains_or_strain_are_refused(
         states, grains=replace(grains, radii=grains.radii.at[1].set(grains.radii[1, ::-1]))
     )
     for words, given in {
-        "finite numbers, and state 1": (flow, lost, strains),
+        "state 1 cannot be written: state must have only finite": (flow, lost, strains),
         "have the same grains, and state 1": (flow, swapped, strains),
         "packing_fraction must be 0.78": (replace(flow, packing_fraction=0.5), states, strains),
         "strain must be that by which the cell is tilted": (flow, states, strains * 1.01),

@@ -153,6 +153,8 @@ def test_outside_the_range_is_refused_or_nan_where_jax_traces_it() -> None:
         jg.InputError, match=r"packing_fraction must be between 0.1 and 0.83, the range"
     ):
         jg.validity(0.5, [0.5, 0.84])
+    end = jg.validity(np.float32(0.98), 0.5).measured["pressure"]  # which is 0.98000001907
+    assert end == jg.validity(0.98, 0.5).measured["pressure"]
     for wrong in ("a", None, np.nan, []):
         with pytest.raises(jg.InputError, match="restitution must be between"):
             jg.validity(wrong, 0.5)

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from benchmarks.peers.front import COST, rows_of
+from benchmarks.peers.front import COST, failure_of, rows_of
 from jaxgran.plotting.style import (
     INTERVAL_COLOUR,
     LABEL_SIZE,
@@ -89,7 +89,7 @@ def _draw_curve(
     style = {"color": look.colour, "fontsize": SMALL_SIZE}
     rows = rows_of(flow, curve)
     if place and any(row["curve"] == curve for row in flow["rows"]):
-        label = look.label if rows else f"$\\times$ {look.label}\n    collapses"
+        label = look.label if rows else f"$\\times$ {look.label}\n    {failure_of(curve)}"
         axes.text(*place, label, transform=axes.transAxes, **style)
     if not rows:
         return

@@ -32,7 +32,14 @@ from jaxtyping import Array, Float, Int
 from jaxgran.dynamics.snapshots import Snapshot, collided
 from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import displacement
-from jaxgran.model.checks import InputError, as_array, concrete_or_none, require, require_number
+from jaxgran.model.checks import (
+    InputError,
+    as_array,
+    at_most,
+    concrete_or_none,
+    require,
+    require_number,
+)
 from jaxgran.model.state import State
 
 _REACH = 6.0  # widths, at which the Gaussian has fallen to e⁻¹⁸ = 1.5e-8 of its peak
@@ -112,8 +119,8 @@ def fields_at(snapshot: Snapshot, points: Float[Array, "points 2"], width: float
         "points", points, lambda x: x.ndim == 2 and x.shape[1] == 2 and np.isfinite(x), accepted
     )
     widest = _widest(snapshot.state)
-    accepted = f"positive and at most {widest:.4g} in this cell"
-    require_number("width", width, lambda x: (x > 0) & (x <= widest), accepted)
+    accepted = f"positive and at most {widest:g} in this cell"
+    require_number("width", width, lambda x: (x > 0) & at_most(x, widest), accepted)
     return _fields_at(snapshot, points, width)
 
 

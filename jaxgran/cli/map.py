@@ -19,11 +19,11 @@ from jaxgran.cli.outcome import (
     told_how_to_resume,
 )
 from jaxgran.cli.output import JSON, print_json, print_table, print_text
-from jaxgran.cli.terminal import say_cache, say_written
+from jaxgran.cli.terminal import say, say_cache, say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.choices import HALF_INTERVAL, FileFormat
-from jaxgran.model.display import in_brackets
+from jaxgran.model.display import counted, in_brackets
 
 MAP_EXAMPLES = {
     "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two "
@@ -78,7 +78,8 @@ def run_map_command(
     pictures = []
     if not interrupted:
         with told_how_to_resume(output, finished=True):
-            pictures = draw_beside(data if whole else None, output, format, overwrite, existed)
+            to_draw = data if whole else None
+            pictures = draw_beside(to_draw, output, format, overwrite, existed, written)
     if json:
         print_json(entries(data))
     elif whole:
@@ -106,19 +107,23 @@ def require_new_figures(output: Path, format: FileFormat) -> None:
 
 
 def draw_beside(
-    data, output: Path, format: FileFormat, overwrite: bool, existed: bool
+    data, output: Path, format: FileFormat, overwrite: bool, existed: bool, written: bool
 ) -> list[Path]:
-    """Draw the figures of a map beside its file, none of a part, then remove those of a map that it
-    replaced.
+    """Draw the figures of a map beside its file, none of a part. Of a map that was there before,
+    remove the others with ``overwrite``, or else name them.
 
-    Files that are there are kept without ``overwrite``. The files drawn.
+    Figures that are there are kept if the file was not ``written``. The files drawn.
     """
-    from jaxgran.plotting.map_figures import remove_pictures, save_figures
+    from jaxgran.plotting.map_figures import pictures_beside, save_figures
 
-    stem = output.with_suffix("")
-    pictures = [] if data is None else save_figures(data, stem, format, overwrite=overwrite)
-    if overwrite and existed:
-        remove_pictures(output, but=pictures)
+    stem, renew = output.with_suffix(""), overwrite or written
+    pictures = [] if data is None else save_figures(data, stem, format, overwrite=renew)
+    if renew and existed:
+        for file in sorted(pictures_beside(output) - {*pictures}):
+            if overwrite:
+                file.unlink()
+            else:
+                say(f"{file} shows the map as it was before: draw it again by jaxgran plot.")
     return pictures
 
 
@@ -182,7 +187,7 @@ def _print_plane(data, values, halves, title: str) -> None:
         ]
         rows.append([f"{nu:g}", *cells])
     columns = ["ν", *(f"α = {x:g}" for x in data.restitution.values)]
-    about = "In brackets: 95 % half-width of the last digits."
+    about = "In brackets: 95 % half-width of the last digits; bars of figures are standard errors."
     mark = " *: bad status." if data.status.any() else ""
     print_table(f"{title}. {about}{mark}", columns, rows)
 
@@ -198,4 +203,4 @@ def _print_success_of_theory(data) -> None:
     if known := np.isfinite(error).sum():
         right = (abs(error) <= 0.1).sum()
         words = "Kinetic theory is within 10 % of the pressure of a large system at"
-        print_text(f"{words} {right} of {known} points.")
+        print_text(f"{words} {right} of {counted(known, 'point')}.")

@@ -40,7 +40,7 @@ def run_merge_command(
     data = merge_maps(files)
     data.attrs["command"] = command_line()
     write_dataset(data, output)
-    pictures = draw_beside(data, output, format, overwrite, existed)
+    pictures = draw_beside(data, output, format, overwrite, existed, written=True)
     print_tables(data)
     finish(data, [output, *pictures], interrupted=False)
 

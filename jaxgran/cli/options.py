@@ -10,12 +10,13 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from jaxgran.cli.terminal import run_command
 from jaxgran.maps.options import Command, Option
 from jaxgran.maps.presets import PRESETS
-from jaxgran.maps.settings import DEFAULTS, OPTIONS, is_new_dimension, options
+from jaxgran.maps.settings import DEFAULTS, OPTIONS, is_new_dimension, options, rounded
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import MAX_REPLICAS
 
@@ -124,7 +125,7 @@ def parse(name: str, row: Option, text: str) -> Any:
     try:
         if isinstance(row.kind, tuple):
             raise ValueError(text)
-        numbers = list(map(int, text.split(",")) if row.kind is int else _numbers(text))
+        numbers = list(map(int, text.split(",")) if row.kind is int else _numbers(name, text))
         if len(numbers) > 1 and not several:
             raise ValueError(text)
     except ValueError:
@@ -139,15 +140,18 @@ def parse(name: str, row: Option, text: str) -> Any:
     return tuple(numbers) if len(numbers) > 1 or is_list else numbers[0]
 
 
-def _numbers(text: str) -> tuple[float, ...]:
-    """Numbers from ``0.1,0.5,0.9`` or ``start:stop:count``, both ends included."""
+def _numbers(name: str, text: str) -> tuple[float, ...]:
+    """Numbers from ``0.1,0.5,0.9`` or ``start:stop:count``, both ends included, with equal gaps, or
+    equal ratios of time steps.
+    """
     if ":" not in text:
         return tuple(float(x) for x in text.split(","))
     start, stop, count = text.split(":")
-    first, gap, steps = float(start), float(stop) - float(start), int(count) - 1
-    if not 1 <= steps < MAX_REPLICAS:
-        raise ValueError(count)
-    return tuple(round(first + gap * k / steps, 12) for k in range(steps + 1))
+    ends, points = (float(start), float(stop)), int(count)
+    if not 2 <= points <= MAX_REPLICAS or (name == "timestep" and min(ends) <= 0):
+        raise ValueError(text)
+    series = np.geomspace if name == "timestep" else np.linspace
+    return tuple(map(rounded, series(*ends, points).tolist()))
 
 
 def examples(commands: Mapping[str, str]) -> str:

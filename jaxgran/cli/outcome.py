@@ -24,7 +24,7 @@ from jaxgran.cli.terminal import (
 )
 from jaxgran.maps.interruption import Interrupted, is_interruption
 from jaxgran.maps.settings import OPTIONS
-from jaxgran.model.display import to_two_digits, with_error
+from jaxgran.model.display import counted, to_two_digits, with_error
 
 _PRINTED = {
     "force_ratio": "force ratio",
@@ -172,7 +172,7 @@ def _say_errors(data) -> None:
     if not known.any():
         return
     strain = data["sums/strain"].where(data["sums/strain"] > 0)
-    lost = f" of the {known.sum()} points with an error" if not known.all() else ""
+    lost = f" of the {counted(known.sum(), 'point')} with an error" if not known.all() else ""
     say(
         f"relative errors: {data.attrs['error']:g} requested, {errors[:, known].max():.2g} at the "
         f"worst point{lost}; "
@@ -210,21 +210,24 @@ def _print_large_system(data) -> None:
     else:
         title = (
             "Averages of a large system: correction for N, and half-widths of 95 % intervals by "
-            "source, in %; median over the points (largest)"
+            "source, in %; median over the points, and the largest below it"
         )
     if not _are_measured(data):
         title += f"\nExtrapolated: the corrections were measured at {MEASURED_FLOWS} only"
     predicted, rows = _predicted(data) if point else {}, []
     for name, words in _PRINTED.items():
         errors, large = relative_ci95(data, name), data[f"{name}_large_system"].values
+        sources = {source: _percent(errors[source]) for source in _SOURCES}
+        sources |= {"timestep": ("–", "–")} if name == "force_ratio" else {}
+        medians, largest = zip(*sources.values(), strict=True)
         if point:
             total = data[f"{name}_large_system_ci95"].sel(error_source="total").item()
-            cells = [with_error(large.item(), total), predicted.get(name, "")]
-        else:
-            cells = [_percent(large / data[name].values - 1), _percent(errors["total"])]
-        sources = {source: _percent(errors[source]) for source in _SOURCES}
-        sources |= {"timestep": "–"} if name == "force_ratio" else {}
-        rows.append([words, *cells, *sources.values()])
+            value = with_error(large.item(), total)
+            rows.append([words, value, predicted.get(name, ""), *medians])
+            continue
+        both = _percent(large / data[name].values - 1), _percent(errors["total"])
+        rows += [[words, *(x[0] for x in both), *medians]]
+        rows += [["  largest", *(x[1] for x in both), *largest]]
     print_table(title, ("average", *values, *_SOURCES.values()), rows)
 
 
@@ -257,16 +260,13 @@ def _are_measured(data) -> bool:
     return data.attrs.get("polydispersity") == MEASURED_POLYDISPERSITY and all(within)
 
 
-def _percent(part) -> str:
-    """The median of a part of the error over the points, and the largest one if there are
-    several.
-    """
+def _percent(part) -> tuple[str, str]:
+    """The median of a part of the error over the points, and the largest one."""
     known = part[np.isfinite(part)]
     if known.size == 0:
-        return ""
+        return "", ""
     largest = known.flat[np.argmax(abs(known))]
-    median, largest = (to_two_digits(100 * x) for x in (np.median(known), largest))
-    return median if part.size == 1 else f"{median} ({largest})"
+    return to_two_digits(100 * np.median(known)), to_two_digits(100 * largest)
 
 
 def finish(
@@ -287,7 +287,9 @@ def finish(
         say(with_options(short_samples_message(data, short), OPTIONS))
     if interrupted:
         missing = (
-            "" if data.status.size == 1 else f" with {len(bad.get('not_run', []))} points missing"
+            ""
+            if data.status.size == 1
+            else f" with {counted(len(bad.get('not_run', [])), 'point')} missing"
         )
         saved = _saved(output, bool(written))
         say(f"jaxgran: interrupted{missing}; {saved}")

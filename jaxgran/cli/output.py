@@ -27,6 +27,7 @@ from rich.table import Table
 
 from jaxgran.maps.options import Option
 
+_BETWEEN = 3  # columns of the terminal between two columns of a table
 JSON = Option("Print one JSON object instead of tables.", bool)
 _IN_ASCII = str.maketrans(
     {
@@ -57,25 +58,63 @@ def print_table(
 ) -> None:
     """Print a table that fits the terminal; a row of one string is a heading.
 
-    All columns but the first are right-aligned, or left-aligned if ``numbers`` is False.
+    All columns but the first are right-aligned, or left-aligned if ``numbers`` is False. A table of
+    numbers that is too wide is printed in parts, so that none is broken.
     """
     console = _console()
-    table = Table(box=box.SIMPLE, header_style="")
     lines = [list(map(_letters, row)) for row in rows]
+    heads = list(map(_letters, columns))
+    print_text(title)
+    for shown in _parts(heads, lines, console.width) if numbers else [range(1, len(heads))]:
+        console.print(_table([0, *shown], heads, lines, numbers, console.width))
+
+
+def _table(
+    shown: Sequence[int],
+    heads: Sequence[str],
+    lines: Sequence[Sequence[str]],
+    numbers: bool,
+    width: int,
+) -> Table:
+    """The table of some of the columns."""
+    table = Table(box=box.SIMPLE, header_style="")
     longest_word = max((len(word) for line in lines for word in line[0].split()), default=0)
-    for k, column in enumerate(columns):
+    for k in shown:
+        first_width = longest_word if width >= 80 else None
+        number_width = _width(heads[k], lines, k) if numbers else None
         table.add_column(
-            _letters(column),
+            heads[k],
             justify="right" if numbers and k else "left",
             overflow="fold",
-            min_width=longest_word if k == 0 and console.width >= 80 else None,
+            min_width=number_width if k else first_width,
         )
     for line in lines:
         if len(line) == 1:
             table.add_section()
-        table.add_row(*line)
-    print_text(title)
-    console.print(table)
+        table.add_row(*(line[k] for k in shown if k < len(line)))
+    return table
+
+
+def _parts(
+    heads: Sequence[str], lines: Sequence[Sequence[str]], width: int
+) -> Iterable[Sequence[int]]:
+    """The columns of each part of a table, as many as fit into the width beside the first one."""
+
+    widths = [_width(head, lines, k) + _BETWEEN for k, head in enumerate(heads)]
+    widths[0] = max(widths[0], len(heads[0]) + _BETWEEN)
+    part: list[int] = []
+    for k in range(1, len(heads)):
+        if part and widths[0] + sum(widths[j] for j in [*part, k]) + 1 > width:
+            yield part
+            part = []
+        part.append(k)
+    yield part
+
+
+def _width(head: str, lines: Sequence[Sequence[str]], k: int) -> int:
+    """The width of column ``k``, whose head may be broken between words."""
+    words = max(map(len, head.split()), default=0)
+    return max([words, *(len(line[k]) for line in lines if k < len(line))])
 
 
 class Entry(NamedTuple):

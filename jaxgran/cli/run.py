@@ -14,8 +14,8 @@ from jaxgran.cli.output import JSON, print_json, print_table
 from jaxgran.cli.terminal import configured_jax, say, with_progress
 from jaxgran.io.paths import require_absent
 from jaxgran.maps.options import Option
-from jaxgran.model.checks import InputError, require_number
-from jaxgran.model.display import unit_text, with_error
+from jaxgran.model.checks import InputError, at_most, require_number
+from jaxgran.model.display import counted, unit_text, with_error
 
 MOST_RECORDED = 100_000  # frames of a trajectory
 _RECORDED_STRAIN = 5.0  # sampled strain where frames are recorded and none is given
@@ -163,11 +163,13 @@ def _recorder(
     accepted = f"at least {least:g}, for {most} frames, and at most the sampled strain, {strain:g}"
     if every is not None:
         require_number(
-            "frame_strain", every, lambda x: (x >= 0.99 * least) & (x <= strain), accepted
+            "frame_strain", every, lambda x: (x >= 0.99 * least) & at_most(x, strain), accepted
         )
     if force_strain is not None:
         accepted = f"above 0 and at most the strain between frames, {between:g}"
-        require_number("force_strain", force_strain, lambda x: (x > 0) & (x <= between), accepted)
+        require_number(
+            "force_strain", force_strain, lambda x: (x > 0) & at_most(x, between), accepted
+        )
     keep, film = [], Frames()
     if "trajectory" in files:
         check_trajectory(files["trajectory"])
@@ -189,8 +191,8 @@ def _write_frames(files: Mapping[str, Path], recorder: Any, film: Any, quiet: bo
     if not quiet:
         say("recording splits the run at different steps: averages change within their errors.")
         for name, file in files.items():
-            frames = recorder.frames if name == "trajectory" else len(film)
-            say(f"wrote {file}: {frames} frames")
+            count = recorder.frames if name == "trajectory" else len(film)
+            say(f"wrote {file}: {counted(count, 'frame')}")
     if recorder.status > 0:
         say(lost_forces(recorder.status))
 

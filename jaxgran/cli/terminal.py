@@ -37,6 +37,9 @@ BAD_STATUS = 3
 INTERRUPTED = 130
 TERMINATED = 143
 
+_SYMBOLS = {"--alpha": "--restitution", "--nu": "--packing-fraction", "--dt": "--timestep"}
+"""The options of quantities that users may call by their symbols."""
+
 _T = TypeVar("_T")
 _UsageError: Any = typer.BadParameter.__base__  # of Typer, which does not export it
 
@@ -75,6 +78,9 @@ def exit_status(app: Callable[..., Any]) -> int:
     try:
         return app(prog_name="jaxgran", standalone_mode=False) or 0
     except _UsageError as mistake:
+        name = _SYMBOLS.get(getattr(mistake, "option_name", ""))
+        if name and any(name in parameter.opts for parameter in mistake.ctx.command.params):
+            mistake.possibilities = [name]
         mistake.show()
         _print_json_error(mistake.format_message())
         return INPUT_MISTAKE

@@ -59,10 +59,10 @@ from jaxgran.files import atomic_write, other_version
 from jaxgran.io.paths import require_place
 from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import centred, remap_tilt
-from jaxgran.model.checks import InputError, refused, require_number, short_repr
+from jaxgran.model.checks import InputError, at_most, refused, require_number, short_repr
 from jaxgran.model.flow import ShearFlow, require_sheared, steps_of_strain
 from jaxgran.model.grains import Grains
-from jaxgran.model.state import State, require_match, require_state
+from jaxgran.model.state import State, require_state
 from jaxgran.model.status import MEANINGS, Status
 
 FORMAT_VERSION = 2
@@ -200,7 +200,9 @@ def write_trajectory(
     least = float(np.min(np.diff(strains), initial=np.inf))
     if force_strain is not None:
         accepted = f"above 0 and at most the strain between frames, {least:g}"
-        require_number("force_strain", force_strain, lambda x: (x > 0) & (x <= least), accepted)
+        require_number(
+            "force_strain", force_strain, lambda x: (x > 0) & at_most(x, least), accepted
+        )
     worst = Status.ok
     with atomic_write(path) as temporary:
         for state, step in zip(frames, steps.astype(int).tolist(), strict=True):
@@ -219,10 +221,10 @@ def lost_forces(worst: int) -> str:
 
 def _require_frame(flow: ShearFlow, state: State, first: State, number: int) -> None:
     """Raise an InputError unless this is a finite state of the flow with the first one's grains."""
-    require_state(flow, state)
-    if not all(np.isfinite(x).all() for x in jax.tree.leaves(state)):
-        raise InputError(f"states must be finite numbers, and state {number} has others.")
-    require_match(flow, state)
+    try:
+        require_state(flow, state)
+    except InputError as mistake:
+        raise InputError(f"state {number} cannot be written: {mistake}") from None
     if state.grains != first.grains:
         raise InputError(
             f"states must have the same grains, and state {number} has others than the first."

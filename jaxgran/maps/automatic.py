@@ -10,9 +10,9 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxgran.dynamics.batch import predicted_cost
-from jaxgran.maps.batches import replica_cost
+from jaxgran.maps.batches import points_of_part, replica_cost
 from jaxgran.maps.progress import duration
-from jaxgran.maps.settings import OPTIONS, MapSettings
+from jaxgran.maps.settings import OPTIONS, MapSettings, rounded
 from jaxgran.maps.settings_checks import (
     FEWEST_STEPS,
     are_numbers,
@@ -46,6 +46,7 @@ _LEAST_SAMPLING_SHARE, _SAMPLING_SHARE = 0.2, 0.5
 _WARMEST = 2.0  # temperature over the expected one
 _SAFE: dict[str, Any] = {"grains": 256, "timestep": 1e-6}  # all flows accept these for "auto"
 _SIZES = np.rint(256 * 2 ** np.arange(0, 20, 0.5)).astype(int)  # few, as each one is compiled
+_SHORT_FLOATS = (np.float16, np.float32)
 PREPARED = 3.3  # correlation strains until most flows are steady
 SECONDS = 5e-7  # of processor time for a unit of ``predicted_cost``, at 1000 grains
 
@@ -115,6 +116,13 @@ def expected_costs(settings: MapSettings) -> list[float]:
         for given, expected in ((settings.equilibrate, prepared), (settings.strain, sampled))
     )
     return list(map(replica_cost, flows, *(x.tolist() for x in strains)))
+
+
+def expected_seconds(settings: MapSettings, costs: Sequence[float]) -> float:
+    """Processor time of the measured points by ``expected_costs``, within a factor of three."""
+    flows = settings.flows()
+    scaled = (costs[k] * (flows[k].grains / 1000) ** 0.2 for k in points_of_part(settings))
+    return SECONDS * settings.seeds * sum(scaled)
 
 
 def _strains(correlation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -294,16 +302,21 @@ def _plain(value: Any, kind: Any) -> Any:
     """A number as a Python number, a list or array of numbers as a tuple; ``MapSettings`` checks
     all other values.
 
-    Whole numbers of a list become floats unless ``kind`` is int.
+    Whole numbers of a list become floats unless ``kind`` is int, and one of float32 becomes the
+    decimal that it stands for, such as 0.3.
     """
     try:
         if isinstance(value, np.ma.MaskedArray) or (
             isinstance(value, Sequence) and len(value) > MAX_REPLICAS
         ):
             return value
+        if isinstance(value, (list, tuple)):
+            value = [rounded(x) if isinstance(x, _SHORT_FLOATS) else x for x in value]
         array = np.asarray(value)
     except (TypeError, ValueError):  # a random key, or lists of different lengths
         return value
     real = array.ndim and array.dtype.kind in "iu" and kind is not int
+    if array.dtype.type in _SHORT_FLOATS:
+        array = np.reshape([rounded(x) for x in array.flat], array.shape)
     plain = array.astype(float).tolist() if real else array.tolist()
     return tuple(plain) if isinstance(plain, list) else plain

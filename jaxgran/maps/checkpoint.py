@@ -5,7 +5,7 @@ complete.
 file                content
 ==================  ================================================================================
 ``settings.npz``    all that the numbers of a replica depend on but its ``ReplicaId``: settings,
-                    versions, sources, precision and device
+                    versions, sources, precision and device; and the commit of the sources
 ``replica-*.npz``   a finished replica, named after its ``ReplicaId``
 ``journal-*.npz``   a batch that is running, see ``journal``, named after its first replica; the end
                     of the name is a hash of what ``settings.npz`` has
@@ -36,7 +36,7 @@ from jaxgran.io.arrays import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps.attributes import digest, first_difference, identity_of_replicas
 from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.own_observables import sums_by_name
-from jaxgran.maps.provenance import made_with, versions_of
+from jaxgran.maps.provenance import code_name, deciding, made_with
 from jaxgran.maps.replica import Key, Replica, ReplicaId, replica_ids
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
@@ -91,7 +91,7 @@ class Checkpoint:
         except FileNotFoundError:  # the folder was removed by hand
             self._unlock()
             self._lock = self._new_lock()
-            write_arrays(self._settings_path, {}, self._identity)
+            self._write_settings()
             self._write({**self.done, **replicas})
         self.done |= replicas
         self.journal_path(list(replicas)).unlink(missing_ok=True)
@@ -100,9 +100,11 @@ class Checkpoint:
         """The file for the journal of a batch, named after its first replica and all else that its
         numbers depend on.
 
-        So a worker of an earlier map that still writes here writes no file of this one.
+        So a worker of an earlier map that still writes here writes no file of this one. The path is
+        absolute, as workers may have another working folder.
         """
-        return self.folder / f"journal-{_name(self._ids[keys[0]])}-{self._digest}.npz"
+        name = f"journal-{_name(self._ids[keys[0]])}-{self._digest}.npz"
+        return (self.folder / name).absolute()
 
     def close(self, finished: bool) -> None:
         """Release the lock, and remove the files of this map if it is finished, and the folder if
@@ -127,7 +129,8 @@ class Checkpoint:
     def _begin(self, resume: bool) -> None:
         """Read the unfinished map that is there, or write the settings of a new one."""
         try:
-            begun = read_arrays(self._settings_path)[1] if self._settings_path.exists() else {}
+            there = self._settings_path.exists()
+            commit, begun = read_arrays(self._settings_path) if there else ({}, {})
         except CorruptFile:
             raise InputError(
                 f"the file settings.npz in {str(self.folder)!r} is damaged: remove the folder."
@@ -135,21 +138,30 @@ class Checkpoint:
         if not (begun and self._files(digest(begun))):
             for path in self.folder.glob("*.npz"):
                 path.unlink()
-            write_arrays(self._settings_path, {}, self._identity)
+            self._write_settings()
             return
         if not resume:
             raise InputError(
                 f"output {str(self._output)!r} has an unfinished map: pass `resume=True` "
-                f"to continue it, or remove the folder {str(self.folder)!r}.",
+                "to continue it, or name another file.",
                 field="output",
             )
         if difference := first_difference(self._identity, begun):
             name, requested, begun_with = difference
+            here = made_with()
+            by, where = "", "with the same parameters"
+            if name in here:
+                other = code_name(begun | {key: str(text) for key, text in commit.items()})
+                by, where = f" was begun by {other}, and this is {code_name(here)}: it", "there"
             raise InputError(
-                f"the unfinished map in {str(self.folder)!r} has {name} {begun_with!r}, not "
-                f"{requested!r}: resume it with the same parameters, or remove the folder."
+                f"the unfinished map in {str(self.folder)!r}{by} has {name} {begun_with!r}, not "
+                f"{requested!r}; resume it {where}, or name another `output`."
             )
         self._read()
+
+    def _write_settings(self) -> None:
+        commit = {"commit": np.array(made_with()["commit"])}
+        write_arrays(self._settings_path, commit, self._identity)
 
     def _files(self, digest: str) -> list[Path]:
         """The replicas and journals of a map."""
@@ -254,8 +266,7 @@ def _identity(settings: MapSettings) -> dict[str, Any]:
     """All that the results depend on, bit for bit, in types of JSON."""
     return {
         **identity_of_replicas(settings),
-        **versions_of(made_with()),
-        "precision": precision(),
+        **deciding(made_with()),
         "device": default_device().platform,
         "number of running sums": len(TABLE),
     }

@@ -30,6 +30,7 @@ def map_dataset(
     settings: MapSettings,
     replicas: Mapping[Key, Replica | None],
     run: Mapping[str, str | float | int],
+    fewer_seeds: bool = False,
 ) -> xr.DataTree:
     """The data of the finished replicas; points without any are NaN with the status ``not_run`` or
     ``failed``.
@@ -45,8 +46,9 @@ def map_dataset(
         that were given up.
       run: further attributes to store: command, wall time, speed; with ``engine`` and ``solver``
         also what ran, where that is not what this process would take.
+      fewer_seeds: whether points may have fewer seeds than others, and are measured then.
     """
-    points = PointValues(settings, replicas)
+    points = PointValues(settings, replicas, fewer_seeds)
     groups: dict[str, dict[str, xr.Variable]] = defaultdict(dict)
     for row in VARIABLES:
         groups[row.group].update(row.on(points))

@@ -41,7 +41,8 @@ def merge_maps(
     Each axis of the result has the values of all maps. The result is that of a single run, bit for
     bit: averages and standard errors are computed from the sums of all replicas, so errors include
     the scatter between seeds of different maps. Of a replica that occurs twice, the first counts.
-    Points that no map has are NaN with the status ``not_run``.
+    Points that no map has are NaN with the status ``not_run``; a point may have fewer seeds than
+    others.
 
     Args:
       maps: data of maps, as ``ratio_map`` returns them, or their files. All settings but the axes,
@@ -123,7 +124,7 @@ def _union(
     keys = list(np.ndindex(len(settings.flows()), settings.seeds))
     ids = dict(zip(keys, replica_ids(settings, keys), strict=True))
     merged = {key: by_id[ids[key]] for key in keys if ids[key] in by_id}
-    return map_dataset(settings, merged, _attributes(maps))
+    return map_dataset(settings, merged, _attributes(maps), fewer_seeds=True)
 
 
 def _union_of_settings(parts: Sequence[MapSettings]) -> MapSettings:

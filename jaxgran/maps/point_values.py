@@ -31,6 +31,7 @@ class PointValues:
 
     settings: MapSettings
     replicas: Mapping[Key, Replica | None]
+    fewer_seeds: bool = False  # whether points may have fewer seeds than others
 
     @cached_property
     def grid(self) -> PointGrid:
@@ -47,10 +48,15 @@ class PointValues:
 
     @property
     def status(self) -> np.ndarray:
-        """The worst of all seeds, and of their samples together."""
+        """The worst of all seeds, and of their samples together.
+
+        An ``error`` is that of all seeds together, so that one imprecise seed does not count.
+        """
+        pooled = (self.statuses == Status.imprecise) & (self.settings.error is not None)
+        worst = worst_status(np.where(pooled, Status.ok, self.statuses), self.fewer_seeds)
         drifting = np.where(self.averages.drifting, Status.not_steady, NOT_RUN)
         imprecise = np.where(self._is_imprecise, Status.imprecise, NOT_RUN)
-        return np.maximum.reduce([worst_status(self.statuses), drifting, imprecise]).astype(np.int8)
+        return np.maximum.reduce([worst, drifting, imprecise]).astype(np.int8)
 
     @property
     def _is_imprecise(self) -> np.ndarray:

@@ -2,6 +2,7 @@
 time left.
 """
 
+import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -30,15 +31,24 @@ class Meter:
       settings: the map.
       costs: relative cost of a replica of each point.
       quiet: whether to report nothing.
+      seconds: what all replicas take, as far as it is known before any is run; infinite where it is
+        not.
     """
 
-    def __init__(self, settings: MapSettings, costs: Sequence[float], quiet: bool):
+    def __init__(
+        self,
+        settings: MapSettings,
+        costs: Sequence[float],
+        quiet: bool,
+        seconds: float = math.inf,
+    ):
         self.flows, self.costs, self.quiet = settings.flows(), costs, quiet
         self.left = dict.fromkeys(points_of_part(settings), settings.seeds)
         self.running: dict[Key, float] = {}  # share of each replica that has been started
         self.total = sum(self.costs[point] for point in self.left) * settings.seeds
         self.done_steps, self.done_cost, self.resumed_cost = 0.0, 0.0, 0.0
         self.start = self.last_line = time.perf_counter()
+        self.seconds = seconds
         self.console = Console(stderr=True, quiet=quiet)
         self.bar = Progress(
             TextColumn("{task.description}"),
@@ -47,7 +57,7 @@ class Meter:
             console=self.console,
             transient=False,
         )
-        self.task = self.bar.add_task("compiling", total=self.total)
+        self.task = self.bar.add_task(self.first_line(), total=self.total)
 
     def advanced(self, advance: Advance) -> None:
         """Count the steps of an advance."""
@@ -89,30 +99,38 @@ class Meter:
             self.last_line = time.perf_counter()
             self.console.print(self._line(), highlight=False)
 
+    def first_line(self) -> str:
+        """The line before anything is done."""
+        expected = "" if math.isinf(self.seconds) else f", about {duration(self.seconds)} expected"
+        return f"0/{len(self.left)} points, compiling{expected}"
+
     def _line(self) -> str:
         seconds, done = time.perf_counter() - self.start, self._cost_of_run
         points = sum(seeds == 0 for seeds in self.left.values())
         percent = 100 * (self.resumed_cost + done) / self.total
         whole = self.total - self.resumed_cost
-        time_left = (
-            duration(seconds * max(whole - done, 0.0) / done)
-            if done > _LEAST_DONE * whole
-            else "unknown time"
-        )
+        if done > _LEAST_DONE * whole:
+            time_left = duration(seconds * max(whole - done, 0.0) / done)
+        elif math.isinf(self.seconds):
+            time_left = "unknown time"
+        else:
+            time_left = f"about {duration(self.seconds * whole / self.total)}"
         speed = f"{self.done_steps / seconds:.3g} replica-steps/s"
         done_points = f"{points}/{len(self.left)} points"
         return f"{percent:.0f} % of the work done, {done_points}, {speed}, {time_left} left"
 
 
 @contextmanager
-def progress(settings: MapSettings, costs: Sequence[float], quiet: bool) -> Iterator[Meter]:
+def progress(
+    settings: MapSettings, costs: Sequence[float], quiet: bool, seconds: float = math.inf
+) -> Iterator[Meter]:
     """A ``Meter`` that is shown while the block runs, and once more at its end."""
-    meter = Meter(settings, costs, quiet)
+    meter = Meter(settings, costs, quiet, seconds)
     if meter.console.is_terminal and not quiet:
         with meter.bar:
             yield meter
     else:
-        meter.console.print(f"0/{len(meter.left)} points, compiling", highlight=False)
+        meter.console.print(meter.first_line(), highlight=False)
         yield meter
         meter.console.print(meter._line(), highlight=False)
 

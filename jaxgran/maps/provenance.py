@@ -35,5 +35,16 @@ def versions_of(made: Mapping[str, str]) -> dict[str, str]:
     """The versions and sources on which the numbers depend, of what ``made_with`` returns or a file
     has.
     """
-    names = ("code_digest", *(f"version_{name}" for name in DECIDING))
+    names = (*(f"version_{name}" for name in DECIDING), "code_digest")
     return {name: made[name] for name in names if name in made}
+
+
+def deciding(made: Mapping[str, str]) -> dict[str, str]:
+    """The same and the precision."""
+    return versions_of(made) | {"precision": made.get("precision", "")}
+
+
+def code_name(made: Mapping[str, str]) -> str:
+    """The code that a map was made with, in words."""
+    commit = f", commit {made['commit']}" if made.get("commit") else ""
+    return f"jaxgran {made.get('version_jaxgran', 'of an unknown version')}{commit}"

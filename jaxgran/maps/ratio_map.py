@@ -3,6 +3,7 @@ dataset and a file.
 """
 
 import inspect
+import math
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +19,7 @@ import xarray as xr
 from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.engine import Engine, in_lockstep
 from jaxgran.environment import usable_cores
-from jaxgran.maps.automatic import chosen_settings, expected_costs
+from jaxgran.maps.automatic import chosen_settings, expected_costs, expected_seconds
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import Provenance
 from jaxgran.maps.dataset import map_dataset, run_attributes
@@ -40,6 +41,7 @@ from jaxgran.maps.store import Store, open_store, replica_count
 from jaxgran.maps.variables import COORDINATES, VARIABLES
 from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.choices import Activation
+from jaxgran.model.display import counted
 from jaxgran.sampling.observables import OBSERVABLES
 
 P = ParamSpec("P")
@@ -105,8 +107,8 @@ def ratio_map(
 
     With ``output``, finished replicas are kept in a folder beside it while the map runs. If
     ``resume`` is True, an unfinished map of the same parameters is continued, also with other axes,
-    seeds or part, and a finished one is read from its file; otherwise the former is an error. A
-    file with anything else is replaced only if ``overwrite`` is True. ``save_figures`` draws the
+    seeds or part, and a finished one is read from its file, if it is of this version; otherwise
+    both are errors. A file is replaced only if ``overwrite`` is True. ``save_figures`` draws the
     figures of ``jaxgran map``, and ``open_map`` reads the file.
 
     Args:
@@ -189,7 +191,9 @@ def run_missing(settings: MapSettings, run: RunOptions, store: Store) -> Measure
     attributes: dict[str, Any] = {"workers": workers, "resumed_replicas": len(results)}
     made: Provenance = {}
     interruption = None
-    with progress(settings, expected_costs(settings), run.progress is not True) as meter:
+    costs, known = expected_costs(settings), not in_lockstep() and run.scheduler is None
+    expected = expected_seconds(settings, costs) / workers if known else math.inf
+    with progress(settings, costs, run.progress is not True, expected) as meter:
         meter.resumed(results)
 
         def report(advance: Advance) -> None:
@@ -256,8 +260,8 @@ def _workers(run: RunOptions) -> int:
 def _tell_resumed(settings: MapSettings, run: RunOptions, checkpoint: Checkpoint) -> None:
     """Print how much of a map is done, and which files are damaged."""
     run.tell(
-        f"continued: {len(checkpoint.done)} of {replica_count(settings)} replicas are done, "
-        f"{len(checkpoint.interrupted)} batches under way."
+        f"continued: {len(checkpoint.done)} of {counted(replica_count(settings), 'replica')} done, "
+        f"{counted(len(checkpoint.interrupted), 'batch')} under way."
     )
     if checkpoint.damaged:
         run.tell(f"damaged and computed again: {', '.join(checkpoint.damaged)}.")

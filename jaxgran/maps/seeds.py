@@ -25,14 +25,13 @@ def replica_statuses(settings: MapSettings, replicas: Mapping[Key, Replica | Non
     return statuses
 
 
-def worst_status(statuses: np.ndarray) -> np.ndarray:
+def worst_status(statuses: np.ndarray, fewer_seeds: bool = False) -> np.ndarray:
     """The worst status (points,) over the seeds; ``NOT_RUN`` if a seed is missing and the others
-    are ok.
+    are ok, or, where points may have fewer seeds than others, if all are missing.
     """
     worst = statuses.max(axis=1)
-    return np.where(
-        (statuses.min(axis=1) == NOT_RUN) & (worst <= Status.ok), NOT_RUN, worst
-    ).astype(np.int8)
+    missing = (statuses.min(axis=1) == NOT_RUN) & (not fewer_seeds)
+    return np.where(missing & (worst <= Status.ok), NOT_RUN, worst).astype(np.int8)
 
 
 def seed_strains(

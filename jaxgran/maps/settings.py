@@ -47,7 +47,8 @@ class MapSettings:
 
     ``solver`` and ``engine`` are values, see ``ProjectedMethod`` and ``dynamics.engine``; None
     stands for the default solver and for the automatic choice of an engine. A given ``tolerance``
-    becomes that of the solver. Restitutions and packing fractions are sorted.
+    becomes that of the solver. Restitutions and packing fractions are sorted. These and
+    time steps are rounded to ten digits, so that 0.3 and 0.1 + 0.2 are one point.
 
     Raises:
       InputError: (a ValueError) a parameter is out of its range.
@@ -157,6 +158,8 @@ class MapSettings:
 
         object.__setattr__(self, "solver", with_tolerance(self.solver, self.tolerance))
         object.__setattr__(self, "tolerance", None)
+        for name in ("restitution", "packing_fraction", "timestep"):
+            object.__setattr__(self, name, _rounded(getattr(self, name)))
         check_axes(self)
         self._sort_plane()
         check_settings(self)
@@ -240,6 +243,22 @@ class MapSettings:
         are uniform.
         """
         return None if self.diameters is None else self.grains_of(8 * len(self.diameters), replicas)
+
+
+def rounded(number: Any) -> Any:
+    """A real number to ten digits, or to those that its type has; anything else unchanged.
+
+    Examples:
+      >>> rounded(0.1 + 0.2), rounded(np.float32(0.3)), rounded("auto")
+      (0.3, 0.3, 'auto')
+    """
+    if not isinstance(number, (float, np.floating)):
+        return number
+    return float(f"{number:.{min(10, np.finfo(type(number)).precision)}g}")
+
+
+def _rounded(values: Any) -> Any:
+    return tuple(map(rounded, values)) if isinstance(values, tuple) else rounded(values)
 
 
 # a map of many points has hundreds of batches

@@ -159,13 +159,14 @@ def _check_observe(observe: Any, flow: ShearFlow) -> None:
 
 def _check_timesteps(settings: MapSettings, flows: ShearFlow) -> None:
     """Raise an InputError if a time step does not fit to the flows or to the sampled strain."""
-    shortest, longest = min(settings.timesteps), max(settings.timesteps)
+    shortest, coarsest = min(settings.timesteps), max(settings.timesteps)
     if shortest < SHORTEST_TIMESTEP:
         reason = f"must be at least {SHORTEST_TIMESTEP:g} / shear rate"
         raise refused("timestep", shortest, reason)
     strain = LEAST_SAMPLE if settings.strain is None else settings.strain
     if strain > MAX_STEPS * shortest:
-        most = f"{MAX_STEPS} time steps, that is {MAX_STEPS * shortest:g}"
+        longest = two_digits(MAX_STEPS * shortest, up=False)
+        most = f"{MAX_STEPS} time steps, that is {longest}"
         raise refused("strain", strain, f"must be at most {most}")
     temperature = temperature_of(settings, flows)
     limits = longest_timestep(temperature, flows.packing_fraction, flows.activation)
@@ -176,8 +177,8 @@ def _check_timesteps(settings: MapSettings, flows: ShearFlow) -> None:
         reason = f"must be at most {most} at {point_text(flows, worst)} to avoid deep overlaps"
         reason += ", which is safe for all points, or auto" if len(limits) > 1 else ", or auto"
         raise refused("timestep", float(np.asarray(flows.timestep)[worst]), reason)
-    if round(strain / longest) < FEWEST_STEPS:
-        least = f"{FEWEST_STEPS} time steps, that is {FEWEST_STEPS * longest:g}"
+    if round(strain / coarsest) < FEWEST_STEPS:
+        least = f"{FEWEST_STEPS} time steps, that is {FEWEST_STEPS * coarsest:g}"
         raise refused("strain", strain, f"must be at least {least}")
 
 

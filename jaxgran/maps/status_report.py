@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from jaxgran.maps.schema import MapData, flag_names, flattened, parts
+from jaxgran.model.display import counted
 from jaxgran.model.status import MEANINGS
 from jaxgran.sampling.thresholds import FEWEST_CORRELATION_STRAINS
 
@@ -44,7 +45,9 @@ def bad_points(data: MapData) -> dict[str, list[str]]:
 def bad_points_message(data: MapData, bad: dict[str, list[str]]) -> str:
     """How many points have a bad status, which ones, and what to do."""
     failed = sum(map(len, bad.values()))
-    count = "the flow" if data.status.size == 1 else f"{failed} of {data.status.size} points"
+    count = (
+        "the flow" if data.status.size == 1 else f"{failed} of {counted(data.status.size, 'point')}"
+    )
     parts = [f"{name.replace('_', ' ')} at {_some(points)}" for name, points in bad.items()]
     hints = [f"{name.replace('_', ' ')}: {MEANINGS[name]}" for name in bad if name in MEANINGS]
     return f"{count} failed: {'; '.join(parts)}. Meaning: {'; '.join(hints)}."

@@ -16,6 +16,7 @@ from jaxgran.maps.attributes import (
 )
 from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.checkpoint import Checkpoint, checkpoint_folder
+from jaxgran.maps.provenance import code_name, deciding, made_with
 from jaxgran.maps.settings import MapSettings, RunOptions
 from jaxgran.model.checks import InputError, short_repr
 
@@ -67,6 +68,12 @@ def open_store(settings: MapSettings, run: RunOptions) -> Iterator[Store]:
         and checkpoint_folder(run.output).exists()
         and identity_of_replicas(from_attrs(earlier)) == identity_of_replicas(settings)
     )
+    if earlier is not None and not (difference or run.resume or run.overwrite):
+        raise InputError(
+            f"output {short_repr(str(run.output))} already exists and has this map; pass "
+            "`resume=True` to keep its points, or `overwrite=True` to replace it.",
+            field="output",
+        )
     if difference and not (run.overwrite or continued):
         raise InputError(
             f"output {short_repr(str(run.output))} already exists and has {difference}; "
@@ -77,6 +84,14 @@ def open_store(settings: MapSettings, run: RunOptions) -> Iterator[Store]:
     try:
         is_new = not (checkpoint.done or checkpoint.interrupted)
         result = finished if run.resume and is_new and not difference else None
+        if result is not None and (other_code := _other_code(result)):
+            if not run.overwrite:
+                raise InputError(
+                    f"output {short_repr(str(run.output))} {other_code}; draw it as it is by "
+                    "jaxgran plot, or pass `overwrite=True` to measure it again.",
+                    field="output",
+                )
+            result = None
         yield Store(run.output, checkpoint, finished, result)
     except BaseException as error:
         if isinstance(error, OSError) and checkpoint.done:
@@ -85,6 +100,18 @@ def open_store(settings: MapSettings, run: RunOptions) -> Iterator[Store]:
         checkpoint.close(finished=False)
         raise
     checkpoint.close(finished=len(checkpoint.done) == replica_count(settings))
+
+
+def _other_code(data: xr.DataTree) -> str:
+    """With what a map was made, if the numbers of this process could be others; else ""."""
+    here, there = made_with(), {str(name): str(value) for name, value in data.attrs.items()}
+    if difference := first_difference(deciding(here), deciding(there)):
+        name, now, before = difference
+        return (
+            f"was made with {code_name(there)}, and this is {code_name(here)}: it has {name} "
+            f"{before!r}, not {now!r}"
+        )
+    return ""
 
 
 def _earlier_map(path: Path, settings: MapSettings) -> tuple[xr.DataTree | None, str]:

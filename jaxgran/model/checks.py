@@ -64,6 +64,20 @@ def two_digits(value: float, up: bool) -> str:
     return f"{(np.ceil if up else np.floor)(value / unit) * unit:.1e}"
 
 
+_ROUNDING = 1e-5  # of a limit that is computed, stored in single precision or printed by ``:g``
+
+
+def at_most(value: Any, limit: Any) -> Any:
+    """Whether a value is at most a positive limit, but for the rounding of a message or of single
+    precision.
+
+    Examples:
+      >>> 0.007 <= 0.7 / 100, at_most(0.007, 0.7 / 100), at_most(np.float32(0.98), 0.98)
+      (False, True, True)
+    """
+    return value <= limit * (1 + _ROUNDING)
+
+
 _SHORT_REPR = Repr()
 _FEW = 100  # numbers of an array that is quoted as a list
 _SHORT_REPR.maxother = _SHORT_REPR.maxstring = 100

@@ -44,6 +44,17 @@ def _text(value: Any, error: Any) -> str:
     return f"<{shape} values, {spread}{lost}>"
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things.
+
+    Examples:
+      >>> counted(1, "point"), counted(0, "batch")
+      ('1 point', '0 batches')
+    """
+    ending = "" if number == 1 else "es" if noun.endswith("ch") else "s"
+    return f"{number} {noun}{ending}"
+
+
 def with_error(value: float, error: float) -> str:
     """A value and its standard error as text, both to the digits that the error leaves.
 

@@ -21,6 +21,7 @@ from jaxgran.model.checks import (
     require_number,
     require_whole,
     short_repr,
+    two_digits,
 )
 from jaxgran.model.choices import (
     MAX_GRAINS,
@@ -194,7 +195,12 @@ def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:
         require(
             "strain", strain, lambda x: x >= 0.99 * least, f"at least {parts} time steps, {least:g}"
         )
-        require("strain", strain, lambda x: x <= most, f"at most {MAX_STEPS} time steps, {most:g}")
+        require(
+            "strain",
+            strain,
+            lambda x: x <= most,
+            f"at most {MAX_STEPS} time steps, {two_digits(most, up=False)}",
+        )
 
 
 def steps_of_strain(flow: ShearFlow, strain: Any) -> Any:

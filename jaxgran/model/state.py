@@ -162,7 +162,7 @@ def _require_arrays(grains: int, arrays: dict[str, Any]) -> None:
             f"state must be of one precision, and its numbers are {' and '.join(precisions)}: "
             "jax.tree.map(lambda x: x.astype(float), state) makes them one."
         )
-    require_native("state", state)
+    require_native("state", arrays)
 
 
 def _require_apart(radii: np.ndarray, positions: np.ndarray, side: float, tilt: float) -> None:

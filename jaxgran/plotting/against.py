@@ -57,7 +57,7 @@ def ratio_against_timestep(data: MapData) -> Figure:
     set_ratio_scale(axes, data.force_ratio.values)
     label_log_axis(axes.xaxis)
     _add_legend(figure, data)
-    describe(figure, data, "Force ratio against the time step, with standard errors", chosen)
+    describe(figure, data, "Force ratio against the time step; bars are standard errors", chosen)
     return figure
 
 

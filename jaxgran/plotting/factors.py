@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jaxgran.maps.schema import RATIO, MapData, what_lacks
+from jaxgran.model.display import counted
 from jaxgran.plotting.selection import describe, selection, suspect
 from jaxgran.plotting.style import (
     NU_LABEL,
@@ -122,9 +123,12 @@ def enskog_factors(data: MapData) -> Figure:
         figure,
         data,
         f"At this $N$ the theory's contact pressure is right within 10 % at {whole} of "
-        f"{logs[0].size} points, Enskog's at the measured temperature at {enskog}, each of its "
-        f"assumptions at {all_right}{': errors cancel' if enskog > all_right else ''}",
-        "Each factor replaces one more assumption by what is measured; thick: their product",
+        f"{counted(np.isfinite(logs).all(axis=0).sum(), 'measured point')}, Enskog's at the "
+        f"measured temperature at {enskog}, each of its assumptions at {all_right}"
+        f"{': errors cancel' if enskog > all_right else ''}",
+        f"Shown and counted: {len(chosen)} of {count} restitutions" if len(chosen) < count else "",
+        "Each factor replaces one more assumption by what is measured; thick: their product; bars "
+        "are standard errors",
     )
     return figure
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -114,18 +114,14 @@ def _writable(stem: Path | str) -> Path:
     return stem
 
 
-def remove_pictures(path: Path, but: Iterable[Path] = ()) -> None:
-    """Remove the pictures of a map that was beside a dataset before: all but some, in whatever
-    format.
-    """
+def pictures_beside(path: Path) -> set[Path]:
+    """The figures of a map that are beside its dataset, in whatever format."""
     names = {
         path.with_name(f"{path.stem}_{name}.{end}")
         for name in FIGURES
         for end in get_args(FileFormat)
     }
-    for file in names - {*but}:
-        if file.is_file():
-            file.unlink()
+    return set(filter(Path.is_file, names))
 
 
 def require_file(format: Any, dpi: Any) -> None:

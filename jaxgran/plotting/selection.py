@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from jaxgran.maps.schema import FINEST, RATIO, MapData, finest, flag_names, require_map
 from jaxgran.model.checks import InputError
+from jaxgran.model.display import counted
 from jaxgran.plotting.style import add_caption, scientific
 
 
@@ -70,7 +71,8 @@ def describe(figure: Figure, data: xr.Dataset, *sentences: str) -> None:
     measured = np.isfinite(data.force_ratio.values)
     counts = Counter(name for name in _status_names(data).flat if name != "ok")
     bad = ", ".join(f"{name.replace('_', ' ')} ({count})" for name, count in counts.most_common())
-    missing = f"{(~measured).sum()} of {measured.size} points have no value"
+    lost = (~measured).sum()
+    missing = f"{lost} of {counted(measured.size, 'point')} without a value"
     notes = [f"Status not ok: {bad}"] * bool(bad) + [missing] * (not measured.all())
     add_caption(figure, [*sentences, *notes, _parameters(data.attrs)])
     if not measured.any():
@@ -88,7 +90,7 @@ def _parameters(attrs: dict[str, Any]) -> str:
     elif np.ndim(attrs.get("grains", ())) == 0:
         parts.append(f"$N={attrs['grains']}$")
     if attrs.get("seeds") is not None:
-        parts.append("1 seed" if attrs["seeds"] == 1 else f"{attrs['seeds']} seeds")
+        parts.append(counted(attrs["seeds"], "seed"))
     if np.ndim(attrs.get("timestep", ())) == 0:
         parts.append(rf"$\mathrm{{d}}t={scientific(float(attrs['timestep']))}/\dot{{\gamma}}$")
     if "activation" in attrs:

@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 
 from jaxgran.maps.schema import RATIO, MapData, what_lacks
 from jaxgran.model.choices import HALF_INTERVAL
+from jaxgran.model.display import counted
 from jaxgran.plotting.plane import (
     BINARY_EXCESS,
     Legend,
@@ -159,15 +160,18 @@ def theory_errors(data: MapData) -> Figure:
         axes.set_title(f"({letter}) {_QUANTITIES[quantity]}: {titles[column]}")
     label_axes(grid)
     add_plane_legend(figure, legend)
-    wrong = abs(np.expm1(error_parts(data, "pressure")["total"][0])) > 0.1
-    binary = wrong & (data.force_ratio.values < 1 + BINARY_EXCESS)
+    total = error_parts(data, "pressure")["total"][0]
+    wrong = abs(np.expm1(total)) > 0.1
+    binary = (wrong & (data.force_ratio.values < 1 + BINARY_EXCESS)).sum()
     describe(
         figure,
         data,
-        f"Kinetic theory misses the pressure by more than 10 % at {wrong.sum()} of {wrong.size} "
-        f"points, {binary.sum()} of which have a force ratio below {1 + BINARY_EXCESS:g}",
-        "Left: theory over the stress of a large system, with its total error. Right: the measured "
-        "flow with all collisions taken as binary, over measurement",
+        f"Kinetic theory misses the pressure by more than 10 % at {wrong.sum()} of "
+        f"{counted(np.isfinite(total).sum(), 'measured point')}, {binary} of which "
+        f"{'has' if binary == 1 else 'have'} a force ratio below {1 + BINARY_EXCESS:g}",
+        "Left: theory over the stress of a large system, whose standard error has all sources. "
+        "Right: the measured flow with all collisions taken as binary, over measurement, with the "
+        "standard error of sampling",
     )
     return figure
 
@@ -211,11 +215,22 @@ def cluster_shares(data: MapData) -> Figure:
     describe(
         figure,
         data,
-        "Share of the contact pressure in clusters of three or more grains: it grows with the "
-        "excess of the force ratio",
-        f"{beyond} points have an excess too small for its axis" if beyond else "",
+        "Share of the contact pressure in clusters of three or more grains"
+        + (": it grows with the excess of the force ratio" if _grows(data) else ""),
+        f"{counted(beyond, 'point')} left out, whose excess is too small for the axis; bars are "
+        "standard errors"
+        if beyond
+        else "Bars are standard errors",
     )
     return figure
+
+
+def _grows(data: xr.Dataset) -> bool:
+    """Return whether the share grows with the excess: by ranks, over at least three points."""
+    excess, share = data.force_ratio.values, data[_SHARE].values
+    known = np.isfinite(excess) & np.isfinite(share)
+    ranks = [np.argsort(np.argsort(x[known])) for x in (excess, share)]
+    return known.sum() >= 3 and bool(np.corrcoef(ranks)[0, 1] > 0.5)
 
 
 def _draw_shares(axes: Axes, data: xr.Dataset) -> int:

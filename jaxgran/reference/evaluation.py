@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxgran.model.checks import InputError, refused
+from jaxgran.model.checks import InputError, at_most, refused
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.reference.surface import coordinates
 from jaxgran.reference.table import LENGTH, MEASURED, Table, theory_of
@@ -116,10 +116,10 @@ def _checked(name: str, value: Any, low: float, high: float) -> np.ndarray:
         numbers = np.asarray(value, float)
     except (TypeError, ValueError):
         numbers = np.array(np.nan)
-    within = (low <= numbers) & (numbers <= high)
+    within = at_most(low, numbers) & at_most(numbers, high)
     if numbers.size == 0 or not np.all(within):
         wrong = numbers[~within].flat[0] if np.isfinite(numbers).any() else value
         raise refused(
             name, wrong, f"must be between {low:g} and {high:g}, the range of the reference map"
         )
-    return numbers
+    return np.clip(numbers, low, high)
