@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flows import GRAINS, flow_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from oracles import gaps_of, kinetic_energy
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
@@ -16,10 +18,12 @@ from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.tally import TABLE
 from jaxgran.model.cell import displacement, relative_velocity, wrap
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.grains import Grains, own_grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.heated import heated
+from jaxgran.sampling.steady_state import prepare
 
 EPS = np.finfo(float).eps
 COLLISIONS, BLOCKS = 100, 50
@@ -286,6 +290,44 @@ def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit
     for name in TABLE:
         expected = powers.get(name, 1) * getattr(slow_tally, name)
         np.testing.assert_array_equal(getattr(fast_tally, name), expected, err_msg=name)
+
+
+@settings(max_examples=20, deadline=None)
+@given(mass=st.integers(-40, 40), length=st.integers(-8, 8), time=st.integers(-20, 20))
+def test_units_are_free(engines, flowing, mass, length, time) -> None:
+    """Masses, lengths and times in other units, powers of two, repeat the trajectory to the bit,
+    but for lengths: the floor of a residual is in γ̇σ.
+    """
+    m, d, t = 4.0**mass, 2.0**length, 2.0**time
+    state, steps = flowing(0.7), 200
+    units = State(
+        Grains(d * state.grains.radii, m * state.grains.masses),
+        d * state.positions,
+        d / t * state.velocities,
+        d * state.side,
+        state.tilt,
+    )
+    flow = flow_of(0.7, restitution=0.3)
+    one, sums = engines["numba"](flow, state, steps)
+    other, scaled = engines["numba"](
+        replace(flow, shear_rate=1 / t, timestep=1e-3 * t), units, steps
+    )
+    rtol = 0 if length == 0 else 1e-7
+    np.testing.assert_allclose(other.velocities * (t / d), one.velocities, rtol=rtol, atol=rtol)
+    np.testing.assert_allclose(
+        scaled.contact_moment * (t / (m * d**2)), sums.contact_moment, rtol=rtol
+    )
+    assert scaled.status == sums.status and sums.collisions > 10
+
+
+def test_a_flow_of_light_grains_is_prepared_as_any_other() -> None:
+    """The predicted temperature, which begins it, is proportional to the masses."""
+    flow, diameters = ShearFlow(16, 0.7, 0.8, 1e-3), np.linspace(0.74, 1.26, 16)
+    heavy, light = (
+        prepare(flow, jax.random.key(0), 0.1, own_grains(diameters, masses=m * diameters**2))
+        for m in (1.0, 2.0**-30)
+    )
+    np.testing.assert_allclose(light.velocities, heavy.velocities, rtol=1e-6, atol=1e-6)
 
 
 def test_a_flow_that_is_moved_repeats_its_trajectory_there(engine_run, flowing):

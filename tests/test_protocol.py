@@ -210,9 +210,10 @@ def test_prepare_names_the_replicas_that_failed(batch, keys, monkeypatch) -> Non
     bad = batch._replace(status=np.array([Status.ok, Status.not_steady]))
     monkeypatch.setattr(steady_state, "prepare_batch", lambda *_, **__: bad)
     with pytest.raises(
-        RuntimeError, match=r"^not all replicas could be prepared: 1 \(not_steady\)\.$"
-    ):
+        RuntimeError, match=r"^not all replicas could be prepared: 1 \(not_steady\); .*`states`"
+    ) as caught:
         prepare(FLOWS[0], keys)
+    assert caught.value.states[0] == batch.state[0] and caught.value.status[0] == Status.ok
 
 
 def test_nan_in_one_replica_ends_as_nonfinite_and_leaves_the_others_bit_identical(batch) -> None:

@@ -21,6 +21,7 @@ preparation takes at least three correlation strains.
 from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -63,6 +64,22 @@ from jaxgran.sampling.timestep import (
 )
 
 
+class NotPrepared(RuntimeError):
+    """A flow, or some of a batch, could not be prepared.
+
+    Attributes:
+      states: what was reached, of all replicas.
+      status: their statuses, (replicas,) for a batch.
+    """
+
+    def __init__(self, message: str, states: State, status: Any):
+        super().__init__(message, states, status)
+        self.states, self.status = states, status
+
+    def __str__(self) -> str:
+        return self.args[0]
+
+
 def prepare(
     flow: ShearFlow,
     key: Array,
@@ -97,6 +114,7 @@ def prepare(
         do this. Or this function, which decides in Python when a flow is steady, is called within
         ``jax.jit``, ``jax.vmap`` or a derivative.
       RuntimeError: the flow, or one of the batch, did not become steady or ended with a bad status.
+        Its attributes ``states`` and ``status`` have what was reached, with those of the others.
 
     Examples:
       >>> flows = ShearFlow(grains=16, restitution=[0.5, 0.9], packing_fraction=0.5, timestep=1e-3)
@@ -118,16 +136,19 @@ def prepare(
     on_all_cores = partial(advance_batch, threads=usable_threads())
     batch = prepare_batch(flows, keys, equilibrate, on_all_cores, grains=discs, numerics=numerics)
     tolerated = Status.ok if equilibrate is None else Status.not_steady
-    if single and batch.status[0] > tolerated:
-        raise RuntimeError(f"the flow could not be prepared: {Status(batch.status[0]).name}.")
-    failed = [
-        f"{k} ({Status(status).name})"
-        for k, status in enumerate(batch.status)
-        if status > tolerated
-    ]
+    states = jax.tree.map(lambda x: jnp.asarray(x[0] if single else x), batch.state)
+    failed = {k: Status(x).name for k, x in enumerate(batch.status) if x > tolerated}
+    if single and failed:
+        raise NotPrepared(f"the flow could not be prepared: {failed[0]}.", states, batch.status[0])
     if failed:
-        raise RuntimeError(f"not all replicas could be prepared: {', '.join(failed)}.")
-    return jax.tree.map(lambda x: jnp.asarray(x[0] if single else x), batch.state)
+        names = ", ".join(f"{k} ({name})" for k, name in failed.items())
+        raise NotPrepared(
+            f"not all replicas could be prepared: {names}; the attribute `states` of this error "
+            "has the others.",
+            states,
+            batch.status,
+        )
+    return states
 
 
 def prepare_batch(
