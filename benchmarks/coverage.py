@@ -27,6 +27,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from typing import NamedTuple
 
 import jax
@@ -55,6 +56,7 @@ SHORT_FLOWS = (
     *((0.9, 0.2), (0.6, 0.2), (0.3, 0.5), (0.9, 0.5), (0.1, 0.6)),
     *((0.3, 0.7), (0.9, 0.7), (0.5, 0.8), (0.9, 0.8)),
 )
+SHORT_OBSERVABLES = ("pressure", "force_ratio")
 BLOCKS_A_STRAIN = 16
 
 
@@ -166,30 +168,24 @@ def judge_short(output: Output) -> None:
         truth = averages(
             samples.tally.total(axis=(0, 1)), samples.area[0], flow.grains, flow.shear_rate
         )
-        for strain in strains:
+        row = {
+            "restitution": alpha,
+            "packing_fraction": nu,
+            "correlation_strain": float(samples.correlation_strain.mean()),
+            "covered": {name: [] for name in SHORT_OBSERVABLES},
+            "width": {name: [] for name in SHORT_OBSERVABLES},
+        }
+        for strain, name in product(strains, SHORT_OBSERVABLES):
             parts = [part_of(samples[k], strain) for k in range(count)]
-            for name in ("force_ratio", "pressure"):
-                values = np.array([float(part.averages[name]) for part in parts])
-                errors = np.array([float(part.errors()[name]) for part in parts])
-                off = np.abs(values - float(truth[name])) / np.sqrt(1 - strain / longest / count)
-                rows.append(
-                    {
-                        "restitution": alpha,
-                        "packing_fraction": nu,
-                        "observable": name,
-                        "strain": strain,
-                        "correlation_strain": float(samples.correlation_strain.mean()),
-                        "covered": float(np.mean(off <= NORMAL_QUANTILE * errors)),
-                        "width": float(np.median(errors) / np.std(values, ddof=1)),
-                    }
-                )
-                print(
-                    "α {restitution:g}, ν {packing_fraction:g}, strain {strain}: {observable} "
-                    "{covered:.2f} / {width:.2f}".format(**rows[-1]),
-                    flush=True,
-                )
-    head = {"grains": SHORT_GRAINS, "repeats": count, "timestep": 1e-3}
-    output.write_rows("coverage_short", head, "rows", rows)
+            values = np.array([float(part.averages[name]) for part in parts])
+            errors = np.array([float(part.errors()[name]) for part in parts])
+            off = np.abs(values - float(truth[name])) / np.sqrt(1 - strain / longest / count)
+            row["covered"][name].append(float(np.mean(off <= NORMAL_QUANTILE * errors)))
+            row["width"][name].append(float(np.median(errors) / np.std(values, ddof=1)))
+        rows.append(row)
+        print(f"α {alpha:g}, ν {nu:g}: {row['covered']}, widths {row['width']}", flush=True)
+    head = {"grains": SHORT_GRAINS, "repeats": count, "timestep": 1e-3, "strains": strains}
+    output.write_json("coverage_short", {**head, "rows": rows})
 
 
 def part_of(sample: jg.Sample, strain: int) -> jg.Sample:

@@ -1,13 +1,18 @@
-"""The choice of time step: against temperatures of other programs and the charts that it was read
-off.
+"""Long averages of small flows: against an event-driven program, a value that was measured with
+many replicas, other units of time and shorter time steps. And the choice of time step: against
+temperatures of other programs and the charts that it was read off.
 """
 
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
+from test_event_driven import lattice
 
+import jaxgran as jg
+from benchmarks.independent.event_driven import Law, averages, sheared
 from jaxgran.dynamics.batch import stack
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.prediction import predicted
@@ -93,3 +98,64 @@ def test_errors_of_the_committed_chart_of_whole_runs_are_within_the_bound_and_it
                     name,
                 )
     assert compared > 2 * len(chart["flows"])
+
+
+GRAINS = 64
+
+
+def sampled(strain: float, engine: jg.Jax | None = None, **numbers: float) -> jg.Sample:
+    """A long sample of a steady flow."""
+    flow = jg.ShearFlow(GRAINS, **{"timestep": 1e-3, **numbers})
+    return jg.sample(flow, jg.prepare(flow, jax.random.key(1)), strain, engine=engine)[1]
+
+
+def assert_agree(sample: jg.Sample, expected: dict, scale: float = 1.0) -> None:
+    """Averages are those expected, with their standard errors, within four of both, which are
+    small.
+    """
+    for name, (value, error) in expected.items():
+        own, stderr = getattr(sample, name) / scale, sample.errors()[name] / scale
+        both = np.hypot(stderr, error)
+        assert both < 0.05 * value and abs(own - value) < 4 * both, name
+
+
+def test_averages_of_the_engine_jax_are_those_of_event_driven_discs() -> None:
+    law = Law(0.9)
+    discs, _ = sheared(lattice(8, 0.5), law, 20.0)
+    discs, sums = sheared(discs, law, 200.0, blocks=20)
+    blocks = averages(sums, discs)
+    expected = {
+        name: (np.mean(blocks[name]), np.std(blocks[name], ddof=1) / np.sqrt(20))
+        for name in ("pressure", "granular_temperature")
+    }
+    numbers = {"restitution": 0.9, "packing_fraction": 0.5}
+    assert_agree(sampled(60.0, engine=jg.Jax(), **numbers), expected)
+
+
+def test_the_force_ratio_of_a_dense_flow_is_that_of_64_replicas() -> None:
+    """1.3343 ± 0.0020 over a strain of 3200: ``python -m benchmarks coverage --short``."""
+    sample = sampled(400.0, restitution=0.3, packing_fraction=0.7)
+    assert_agree(sample, {"force_ratio": (1.3343, 0.002)})
+    assert sample.errors()["force_ratio"] < 0.02
+
+
+def test_stresses_go_with_the_square_of_a_shear_rate_that_is_no_power_of_two() -> None:
+    """Bagnold's scaling; that of a power of two is exact."""
+    numbers = {"restitution": 0.7, "packing_fraction": 0.5}
+    one, fast = (
+        sampled(400.0, shear_rate=rate, timestep=1e-3 / rate, **numbers) for rate in (1.0, 3.0)
+    )
+    names = "pressure", "shear_stress", "granular_temperature"
+    assert_agree(fast, {name: (getattr(one, name), one.errors()[name]) for name in names}, 9.0)
+
+
+def test_a_dense_flow_converges_in_the_time_step_within_its_bound() -> None:
+    """A step of 5e-3 makes the pressure too small by far; the bound of each step holds."""
+    numbers = {"restitution": 0.5, "packing_fraction": 0.8}
+    exact = sampled(100.0, timestep=1e-4, **numbers)
+    for timestep, is_coarse in ((5e-3, True), (1e-3, False)):
+        sample = sampled(100.0, timestep=timestep, **numbers)
+        noise = np.hypot(sample.errors()["pressure"], exact.errors()["pressure"]) / exact.pressure
+        error = sample.pressure / exact.pressure - 1
+        assert abs(error) < sample.timestep_error + 3 * noise
+        assert (error < -4 * noise) == is_coarse

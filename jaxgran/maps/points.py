@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from jax.typing import ArrayLike
 
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
@@ -15,6 +14,7 @@ from jaxgran.maps.settings_checks import stack_of_any_size
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import GIVEN_UP
+from jaxgran.sampling.correlation_strain import mass_of_grains
 from jaxgran.sampling.drift import is_drifting
 from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.sample import (
@@ -127,8 +127,3 @@ def _samples(
         if samples:
             by_point[point] = samples
     return by_point
-
-
-def mass_of_grains(packing_fraction: Any, area: ArrayLike) -> Any:
-    """Mass of all grains of a map, the sum of their squared diameters."""
-    return 4 / np.pi * float(packing_fraction) * np.asarray(area)

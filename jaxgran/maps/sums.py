@@ -10,7 +10,7 @@ import xarray as xr
 
 from jaxgran.dynamics.tally import flat_tally, tally_from_flat
 from jaxgran.maps.own_observables import sums_by_name
-from jaxgran.maps.points import PointGrid, mass_of_grains
+from jaxgran.maps.points import PointGrid
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import flag_names, flattened
 from jaxgran.maps.seeds import NOT_RUN
@@ -18,6 +18,7 @@ from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.states import states_of
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import GIVEN_UP, Status
+from jaxgran.sampling.correlation_strain import mass_of_grains
 from jaxgran.sampling.sample import Sample
 
 

@@ -68,6 +68,11 @@ def total_mass(grains: Grains) -> Any:
     return np.sum(np.ascontiguousarray(grains.masses), axis=-1)
 
 
+def mass_of_grains(packing_fraction: Any, area: Any) -> Any:
+    """Mass of all grains whose masses are their squared diameters, in m."""
+    return 4 / np.pi * packing_fraction * area
+
+
 def length_status(strain: Any, correlation_strain: Any) -> Any:
     """``short_sample`` where a sampled strain is below ``FEWEST_CORRELATION_STRAINS``, otherwise
     ``ok``.

@@ -19,8 +19,9 @@ from jaxgran.model.display import are_numbers, rounded, text_of
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import LARGEST_DRIFT, Status, worse
 from jaxgran.sampling.averages import averages
-from jaxgran.sampling.correlation_strain import flow_correlation_strain
+from jaxgran.sampling.correlation_strain import flow_correlation_strain, mass_of_grains
 from jaxgran.sampling.observables import OBSERVABLES, Observables
+from jaxgran.sampling.timestep import stress_error
 from jaxgran.statistics import (
     Estimates,
     correlation_length,
@@ -133,6 +134,16 @@ class Sample(Observables, Indexable):
     def correlation_strain(self) -> Float[Array | np.ndarray, "*replicas"]:
         """The strain of one independent sample, see ``flow_correlation_strain``."""
         return _correlation_strain(self, self.averages)
+
+    @property
+    def timestep_error(self) -> Float[Array | np.ndarray, "*replicas"]:
+        """Bound on the relative error of pressure and shear stress from the time step, that of the
+        intervals of a map, see ``stress_error``.
+        """
+        flow, mass, area = in_numpy((self.flow, self.mass, self.area))
+        of_unit_diameter = mass / mass_of_grains(flow.packing_fraction, area)
+        temperature = self.averages["granular_temperature"] / of_unit_diameter
+        return stress_error(flow.timestep * temperature**0.5, flow.packing_fraction)
 
     @property
     def status(self) -> Int[Array | np.ndarray, "*replicas"]:

@@ -15,6 +15,8 @@ stability`` and ``python -m benchmarks speed_vs_accuracy`` find for this size di
 serve to choose a time step and are not results.
 """
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -69,10 +71,9 @@ def stress_error(crossing: ArrayLike, packing_fraction: ArrayLike) -> np.ndarray
       >>> [round(float(stress_error(1e-3, nu)), 3) for nu in (0.5, 0.7, 0.8)]
       [0.003, 0.01, 0.041]
     """
-    gap = np.minimum(
-        distance_to_jamming(packing_fraction) / (2 * np.asarray(packing_fraction)), 0.5
-    )
-    return np.asarray(crossing) / gap
+    xp = jnp if isinstance(packing_fraction, jax.Array) else np
+    nu = xp.asarray(packing_fraction)
+    return xp.asarray(crossing) / xp.minimum(distance_to_jamming(nu) / (2 * nu), 0.5)
 
 
 def automatic_timestep(
@@ -86,7 +87,8 @@ def automatic_timestep(
 
 def distance_to_jamming(packing_fraction: ArrayLike) -> np.ndarray:
     """Difference between the packing fraction at jamming and this one."""
-    return np.maximum(JAMMING - np.asarray(packing_fraction), _SMALLEST_DISTANCE)
+    xp = jnp if isinstance(packing_fraction, jax.Array) else np
+    return xp.maximum(JAMMING - xp.asarray(packing_fraction), _SMALLEST_DISTANCE)
 
 
 def check_timestep(flow: ShearFlow, theory: SteadyShear, grains: Grains | None = None) -> None:
