@@ -236,9 +236,9 @@ def _influences(
     without = flat[1:].astype(float) if total > 1 else np.full(flat.shape, np.nan)
     influence = (total - 1) * (without.mean(axis=0) - without)
     scale = np.sqrt(np.mean(influence**2, axis=0))
-    alternating = (-1.0) ** np.arange(len(influence))[:, None]  # stands for blocks without scatter
-    influence = np.where(scale > 0, influence / np.where(scale > 0, scale, 1), alternating)
     scale = np.where(scale <= _ROUNDING * total * np.abs(flat[0]), 0, scale)
+    alternating = (-1.0) ** np.arange(len(influence))[:, None]  # stands for blocks without scatter
+    influence = np.where(scale == 0, alternating, influence / np.where(scale == 0, 1, scale))
     return flat[0], np.split(influence, np.cumsum(counts)[:-1]), scale, by_name
 
 

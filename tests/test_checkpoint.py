@@ -38,7 +38,9 @@ def batches() -> list[dict[Key, Replica]]:
     rng = np.random.default_rng(0)
     return [
         {
-            (point, seed): random_replica(rng, SETTINGS, Status.not_steady if point == 1 else 0)
+            (point, seed): random_replica(
+                rng, SETTINGS, Status.not_steady if point == 1 else 0, point
+            )
             for seed in range(2)
         }
         for point in range(3)

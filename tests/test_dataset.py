@@ -147,7 +147,7 @@ def test_factors_and_lengths_are_those_of_the_samples_of_a_point(settings, data,
 
 def test_elastic_flow_has_no_prediction() -> None:
     """Nothing balances the shear at α = 1."""
-    data = map_dataset(MapSettings((0.5, 1.0), (0.6,), timestep=1e-5), {}, RUN)
+    data = map_dataset(MapSettings((0.5, 1.0), (0.6,), timestep=1e-5, equilibrate=1.0), {}, RUN)
     for name in THEORY:
         assert np.isnan(data["theory"][name].values).tolist() == [[False, True]]
 

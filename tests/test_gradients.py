@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flows import EXACT, GRAINS
+from flows import EXACT, GRAINS, of_state
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 from jax import lax
@@ -301,8 +301,8 @@ def collision(gap, scene, dt: float, moving_contacts: bool):
     rest in the shear.
     """
     state = scene([[3.0, 0.0], [4.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]])
+    flow = of_state(ShearFlow(GRAINS, 0.5, 0.02, dt), state)
     state = replace(state, positions=state.positions.at[1, 0].add(gap))
-    flow = ShearFlow(GRAINS, 0.5, 0.02, dt)
     end, _ = exact_advance(flow, state, jnp.int32(round(0.5 / dt)), True, None, moving_contacts)
     return end.positions[0, 0]
 
@@ -333,7 +333,7 @@ def test_at_a_kink_the_derivative_is_one_of_the_two_one_sided_ones(scene):
     derivatives to both sides differ, and the one returned is one of them.
     """
     touching = scene([[3.0, 4.0], [4.0, 4.0], [4.0, 3.0]], [[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
-    flow = ShearFlow(GRAINS, 0.0, 0.02, 1e-6)
+    flow = of_state(ShearFlow(GRAINS, 0.0, 0.02, 1e-6), touching)
 
     @jax.jit
     def pushed(slant):
