@@ -108,7 +108,8 @@ jg.flow_figure(snapshots)
 # %%
 steps = 50 if quick else 500
 state, _ = jg.snapshot_series(flow, state, flow.timestep, 1)
-_, over_steps = jg.sample(flow, state, steps * flow.timestep)
+after, _ = jg.snapshot_series(flow, state, flow.timestep, 1)  # where the first snapshot is taken
+_, over_steps = jg.sample(flow, after, steps * flow.timestep)
 _, snapshots = jg.snapshot_series(flow, state, steps * flow.timestep, steps)
 contacts, impulse = snapshots.contacts, np.asarray(snapshots.impulses)
 reduced = 1 / np.where(contacts.used, contacts.inverse_mass_i + contacts.inverse_mass_j, np.inf)

@@ -1,11 +1,13 @@
 """Objects show themselves in one line: short for any batch, and without a failure."""
 
+import re
+
 import jax
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic import random_tally, sample_of_tally
+from synthetic import random_tally, sample_of_tally, snapshot_of
 
 import jaxgran as jg
 from jaxgran.model.display import with_error
@@ -15,9 +17,13 @@ from jaxgran.sampling.sample import BLOCKS
 TALLIES = random_tally(np.random.default_rng(0), 1000, BLOCKS)
 VALUES = [ShearFlow(64, 0.5, 0.6, 1e-4), ShearFlow(64, np.linspace(0.1, 0.9, 1000), 0.6, 1e-4)]
 VALUES += [sample_of_tally(TALLIES, jg.ShearFlow(64, 0.5, 0.6, 1e-3))]
+SERIES = snapshot_of(np.random.default_rng(0).uniform(0, 40, (9, 64, 2)), 9 * [[(0, 1, 2.0)]])
+VALUES += [SERIES, SERIES[0], SERIES.state]
 
 
-@pytest.mark.parametrize("value", VALUES, ids=["flow", "batch", "samples"])
+@pytest.mark.parametrize(
+    "value", VALUES, ids=["flow", "batch", "samples", "series", "snapshot", "states"]
+)
 def test_the_line_is_short_whatever_stands_in_the_place_of_a_number(value) -> None:
     """JAX fills its trees with tracers, axes, shapes and placeholders."""
     seen = [value]
@@ -28,6 +34,23 @@ def test_the_line_is_short_whatever_stands_in_the_place_of_a_number(value) -> No
     ]
     assert all(repr(one).startswith(type(value).__name__) and "\n" not in repr(one) for one in seen)
     assert len(repr(value)) < 700
+
+
+def test_a_line_names_attributes() -> None:
+    for value in VALUES[3:]:
+        for name in re.findall(r"(\w+)=", repr(value)):
+            assert hasattr(value, name) or name in (
+                "times",
+                "replicas",
+                "grains",
+                "loaded_contacts",
+                "precision",
+            )
+
+
+def test_a_number_that_has_diverged_is_short() -> None:
+    assert with_error(-3e75, 2.5e74) == "(-3.00 ± 0.25)e+75"
+    assert with_error(3e74, 2.5e75) == "(0.3 ± 2.5)e+75"
 
 
 def test_answers_of_the_reference_map_are_shown_in_one_line() -> None:

@@ -301,7 +301,7 @@ def collision(gap, scene, dt: float, moving_contacts: bool):
     rest in the shear.
     """
     state = scene([[3.0, 0.0], [4.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]])
-    flow = of_state(ShearFlow(GRAINS, 0.5, 0.02, dt), state)
+    flow = ShearFlow(GRAINS, 0.5, GRAINS * np.pi / 4 / 40**2, dt)
     state = replace(state, positions=state.positions.at[1, 0].add(gap))
     end, _ = exact_advance(flow, state, jnp.int32(round(0.5 / dt)), True, None, moving_contacts)
     return end.positions[0, 0]

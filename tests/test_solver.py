@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import MAX_DISCS, delassus, exact_velocities, padded_network, random_network
+from synthetic import refused
 
 from jaxgran.contact.delassus import delassus_product, grain_impulses, spectral_bound
 from jaxgran.contact.network import Contacts
-from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi, Nesterov
+from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi, Nesterov, ProjectedMethod
 from jaxgran.contact.solver import solve
 from jaxgran.model.status import Status
 
@@ -202,3 +203,9 @@ def test_compiled_solve_equals_the_interpreted_one(solved):
         )
     np.testing.assert_allclose(compiled.impulses, interpreted.impulses, rtol=0, atol=1e-12)
     np.testing.assert_allclose(compiled.residual, interpreted.residual, rtol=1e-10)
+
+
+def test_a_method_that_no_solve_calls_is_refused() -> None:
+    with refused("and step of Own would never be called; name a function of your own _step"):
+        type("Own", (ProjectedMethod,), {"step": lambda self, now: 1.0})
+    type("Own", (ProjectedMethod,), {"propose": lambda self, now: (now.point, 1.0)})

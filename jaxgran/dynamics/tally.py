@@ -325,7 +325,7 @@ def _documentation() -> str:
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
         for row in rows
     ]
-    return "\n".join(["", border, lines[0], border, *lines[1:], border])
+    return "\n".join(["", "", border, lines[0], border, *lines[1:], border])
 
 
 Tally.__doc__ = (Tally.__doc__ or "") + _documentation()
