@@ -27,7 +27,7 @@ from jaxgran.model.checks import (
     short_repr,
     two_digits,
 )
-from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
+from jaxgran.model.flow import ShearFlow, in_dtype, require_strain, steps_of_blocks, steps_of_strain
 from jaxgran.model.state import State, require_match, require_state
 from jaxgran.sampling.blocks import advance_by_block, sample_of_blocks
 from jaxgran.sampling.correlation_strain import length_status, sampled_correlation_strain
@@ -123,9 +123,12 @@ def sample(
             raise InputError(f"{name} must be a function or None, not {short_repr(function)}.")
     if callback is None:
         if batch is None:
+            flow, strain = in_dtype((flow, strain), state.side.dtype)
             return waited(_sample(flow, state, strain, numerics, blocks, observe))
         option = "" if observe is None else "observe"
-        return shear_batch(_sample, numerics, batch, (blocks, observe), option)
+        flows, states, strains = batch
+        flows, strains = in_dtype((flows, strains), states.side.dtype)
+        return shear_batch(_sample, numerics, (flows, states, strains), (blocks, observe), option)
     if is_traced(flow, numerics, state, strain):
         raise InputError("callback must be None where a sample is transformed, as by jax.jit.")
     replicas = batch or checked_batch(
