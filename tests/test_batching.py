@@ -192,3 +192,24 @@ def test_a_packing_fraction_is_that_of_the_state_alone(name: str, flowing) -> No
     assert status.tolist() == [jg.Status.nonfinite, jg.Status.ok] and np.isfinite(energy[1])
     with refused("packing_fraction must not be differentiated"):
         jax.jit(jax.jacfwd(lambda nu: end(nu)[0]))(0.7)
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_a_condition_of_each_replica_takes_its_own_branch(name: str, states) -> None:
+    def advanced_if(alpha, steps):
+        flow = replace(flow_of(0.7), restitution=alpha)
+        run = partial(advance, flow, replica(states, 0), engine=ENGINES[name])
+        return lax.cond(steps > 1, lambda: run(steps), lambda: run(jnp.int32(0)))
+
+    steps = jnp.asarray([1, 5, 9], jnp.int32)
+    _, tally = jax.jit(jax.vmap(advanced_if))(ALPHAS, steps)
+    np.testing.assert_array_equal(tally.steps, [0, 5, 9])
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_a_second_derivative_is_refused_in_a_sentence(name: str, states) -> None:
+    def velocities(alpha):
+        return advanced(ENGINES[name], alpha, replica(states, 0))[0].velocities
+
+    with pytest.raises(jg.InputError, match="differentiated once"):
+        jax.eval_shape(jax.jacfwd(jax.jacfwd(velocities)), 0.5)

@@ -210,3 +210,9 @@ def test_an_advance_refuses_a_state_of_another_packing_fraction(flowing) -> None
     assert refusal(
         lambda: jg.advance(replace(of(), packing_fraction=0.6), flowing(0.7), STEPS)
     ).startswith("packing_fraction must be 0.7, which the state has, not 0.6")
+
+
+@pytest.mark.parametrize("call", [partial(jg.sample, strain=0.1), partial(jg.advance, steps=STEPS)])
+def test_a_state_of_more_precision_than_that_of_jax_is_refused(flowing, call) -> None:
+    with jax.enable_x64(False), pytest.raises(jg.InputError, match="float32, not float64"):
+        call(of(), flowing(0.7))

@@ -2,11 +2,15 @@
 
 import re
 from dataclasses import replace
+from decimal import Decimal
+from fractions import Fraction
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
+import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -112,3 +116,16 @@ def test_time_steps_of_a_strain_are_those_of_each_flow_of_a_batch() -> None:
     flows = replace(FLOW, timestep=[1e-3, 2e-3])
     assert steps_of_strain(flows, 0.0204).tolist() == [20, 10]
     assert steps_of_strain(flows, np.array([0.0204, 0.0408])).tolist() == [20, 20]
+
+
+@pytest.mark.parametrize("kind", [Decimal, Fraction, xr.DataArray, np.float16, jnp.bfloat16])
+def test_a_number_of_any_library_is_a_number(kind) -> None:
+    assert float(np.asarray(replace(FLOW, restitution=kind(0.5)).restitution)) == 0.5
+    assert "must be between 0 and 1, not" in refusal(restitution=kind(1.5))
+
+
+def test_what_is_no_number_is_named_by_its_type() -> None:
+    assert replace(FLOW, restitution=pd.Series([0.5, 0.6])).restitution.tolist() == [0.5, 0.6]
+    assert refusal(restitution=None).endswith(
+        "as a number or an array of numbers, not None of type NoneType."
+    )

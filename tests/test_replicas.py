@@ -50,7 +50,9 @@ def test_numbers_that_are_the_same_for_all_replicas_are_broadcast() -> None:
     assert_same(FLOWS[1], jg.ShearFlow(GRAINS, 0.5, 0.6, 1e-3))
     assert_same(replace(FLOWS, timestep=1e-4)[2], jg.ShearFlow(GRAINS, 0.8, 0.7, 1e-4))
     single = jg.ShearFlow(GRAINS, jnp.float32([0.5, 0.6]), 0.6, 1e-3)
-    assert {leaf.dtype for leaf in jax.tree.leaves(single)} == {np.dtype("float32")}
+    assert single.timestep.dtype == np.dtype(float) and single.timestep[0] == 1e-3
+    half = jg.ShearFlow(GRAINS, np.float16([0.5, 0.6]), 0.6, 1e-8)
+    assert_same(half[0], jg.ShearFlow(GRAINS, 0.5, 0.6, 1e-8))
     of_traced = jax.jit(lambda x: jg.ShearFlow(GRAINS, ALPHAS, x, 1e-3))(0.6)
     np.testing.assert_array_equal(of_traced.packing_fraction, 0.6)
 
@@ -109,6 +111,17 @@ def test_batches_of_any_size_are_compiled_once(states: State) -> None:
         many = np.arange(count) % 3
         _, found = jg.sample(FLOWS[many], states[many], 0.1, blocks=3)
         assert found.tally.steps.shape == (count, 3)
+    assert sampler._sample._cache_size() == compiled
+
+
+@pytest.mark.parametrize("kind", [float, np.float64, np.float32, partial(jnp.asarray, dtype=float)])
+def test_numbers_of_python_numpy_and_jax_share_one_compilation(states: State, kind) -> None:
+    flow = jg.ShearFlow(GRAINS, 0.5, 0.6, 1e-3)
+    _, expected = jg.sample(flow, states[1], 0.125, blocks=3)
+    compiled = sampler._sample._cache_size()
+    mixed = replace(flow, restitution=kind(0.5), activation=kind(0.5))
+    _, found = jg.sample(mixed, states[1], kind(0.125), blocks=3)
+    assert_same(found, expected)
     assert sampler._sample._cache_size() == compiled
 
 

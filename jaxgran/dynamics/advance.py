@@ -20,6 +20,7 @@ from jaxgran.dynamics.batching import with_forward_derivative, with_own_batching
 from jaxgran.dynamics.engine import Engine, Numba, Numerics, checked_numerics, select_engine
 from jaxgran.dynamics.jax_engine import advance_by_jax, ended, require_advance
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
+from jaxgran.model.checks import InputError
 from jaxgran.model.control_flow import in_batch
 from jaxgran.model.flow import ShearFlow, flow_of_state
 from jaxgran.model.state import State, kinetic_energy, status_at_start
@@ -280,7 +281,7 @@ def call_numba(
     call = jax.ffi.ffi_call(
         TARGET, results, vmap_method="broadcast_all", input_output_aliases=aliases
     )
-    positions, velocities, blocks, memory, records = call(
+    operands = (
         state.positions,
         state.velocities,
         grains.radii,
@@ -289,6 +290,10 @@ def call_numba(
         steps.astype(dtype),
         *(() if memory is None else (memory,)),
     )
+    kinds = {x.dtype.name for x in operands}
+    if kinds != {"float64"}:  # the engine reads doubles whatever it is given
+        raise InputError(f"the engine numba must be given float64 only, not {sorted(kinds)}.")
+    positions, velocities, blocks, memory, records = call(*operands)
     last = blocks[-1]
     end = State(grains, positions, velocities, state.side, last[layout.TILT])
     sums = jax.vmap(sums_from_row)(blocks[:, :NUMBERS], blocks[:, layout.STATUS].astype(jnp.int32))

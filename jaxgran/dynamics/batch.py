@@ -50,8 +50,7 @@ def stack(flows: Sequence[ShearFlow]) -> ShearFlow:
 
     def joined(*values) -> np.ndarray:
         numbers = np.stack([np.asarray(value) for value in values])
-        kind = numbers.dtype if numbers.dtype.kind == "f" else np.dtype(float)
-        return numbers.astype(jax.dtypes.canonicalize_dtype(kind))
+        return numbers.astype(jnp.result_type(float))
 
     return jax.tree.map(joined, *flows)
 

@@ -14,8 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from jaxgran.dynamics.engine import in_lockstep
+from jaxgran.model.checks import InputError
 from jaxgran.model.control_flow import AXIS
 
 T = TypeVar("T")
@@ -27,10 +29,7 @@ def with_own_batching(function: Callable[..., T]) -> Callable[..., T]:
     Where the first argument is the same for all replicas, so are all conditions, and the usual rule
     is taken: as where ``jax.jacfwd`` follows many tangents of one flow.
     """
-    batched_function = custom_vmap(function)
-    together = custom_vmap(lambda *batch: jax.vmap(function, axis_name=AXIS)(*batch))
 
-    @batched_function.def_vmap
     def of_replicas(size: int, batched: Any, *arguments: Any) -> tuple[T, Any]:
         if not any(jax.tree.leaves(batched[0])):
             axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
@@ -39,13 +38,38 @@ def with_own_batching(function: Callable[..., T]) -> Callable[..., T]:
             return _all_batched(together(*_with_axis(size, batched, arguments)))
         return _all_batched(_in_turn(batched_function, batched, arguments))
 
-    @together.def_vmap
     def of_batches(size: int, batched: Any, *arguments: Any) -> tuple[T, Any]:
         batches = _with_axis(size, batched, arguments)
         result = together(*jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batches))
         return _all_batched(jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), result))
 
+    batched_function = _with_rule(function, of_replicas)
+    together = _with_rule(jax.vmap(function, axis_name=AXIS), of_batches)
     return batched_function
+
+
+def _with_rule(function: Callable[..., T], rule: Callable[..., tuple[T, Any]]) -> Callable[..., T]:
+    """``custom_vmap`` of a function with a rule.
+
+    The constants of the function, which ``vmap`` of a condition gives an axis, are arguments here:
+    ``custom_vmap`` by itself fails where constants have one. The rule computes them anew.
+    """
+
+    def call(*arguments: Any) -> T:
+        jaxpr, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+
+        @custom_vmap
+        def of_constants(constants: list[jax.Array], arguments: tuple) -> T:
+            of_leaves = jaxpr_as_fun(ClosedJaxpr(jaxpr.jaxpr, constants))
+            return jax.tree.structure(shapes).unflatten(of_leaves(*jax.tree.leaves(arguments)))
+
+        @of_constants.def_vmap
+        def _(size: int, batched: Any, _: Any, arguments: tuple) -> tuple[T, Any]:
+            return rule(size, batched[1], *arguments)
+
+        return of_constants(jaxpr.consts, arguments)
+
+    return call
 
 
 def with_forward_derivative(
@@ -58,12 +82,19 @@ def with_forward_derivative(
     def derivative(primals: tuple, tangents: list[jax.Array]) -> list[jax.Array]:
         return _of_real_numbers(*jax.jvp(differentiable, primals, _completed(primals, tangents)))
 
-    batched = with_own_batching(derivative)
+    batched = jax.custom_jvp(with_own_batching(derivative))
     wrapped = jax.custom_jvp(engine)
+
+    @batched.defjvp
+    def _(primals: tuple, tangents: tuple) -> Any:
+        raise InputError(
+            "an advance must be differentiated once, not twice: take differences of its first "
+            "derivatives for second ones."
+        )
 
     @wrapped.defjvp
     def _(primals: tuple, tangents: tuple) -> tuple[T, T]:
-        result, change = engine(*primals), batched(primals, _of_real_numbers(primals, tangents))
+        result, change = wrapped(*primals), batched(primals, _of_real_numbers(primals, tangents))
         return result, _completed(result, change)
 
     return wrapped

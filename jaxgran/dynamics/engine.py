@@ -139,10 +139,16 @@ def select_engine(
       option: name of an option that not all engines have; "" if there is none.
 
     Raises:
-      InputError: the engine that was asked for cannot do this.
+      InputError: the engine that was asked for cannot do this, or JAX computes in single precision
+        and the state is in double precision.
     """
     engine = numerics.engine or Numba()
     dtype = precision() if state is None else str(state.positions.dtype)
+    if dtype == "float64" != precision():
+        raise InputError(
+            "state must be of the precision in which JAX computes, float32, not float64: begin "
+            'with jax.config.update("jax_enable_x64", True).'
+        )
     needs = Needs(default_device().platform, dtype, solver_name(numerics.solver), option)
     limits = LIMITS[type(engine)]
     unmet = {

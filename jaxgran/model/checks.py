@@ -1,6 +1,8 @@
 """Checks of user input: an InputError says in one sentence what is accepted."""
 
 from collections.abc import Callable
+from decimal import Decimal
+from fractions import Fraction
 from reprlib import Repr
 from typing import Any
 
@@ -53,7 +55,9 @@ def concrete_or_none(value: Any) -> np.ndarray | None:
     key = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
     number = isinstance(value, (np.generic, np.ndarray, jax.Array)) and not key
     number = number and not isinstance(value, np.ma.MaskedArray)  # its mask would be ignored
-    return np.asarray(value if number else None)
+    array = np.asarray(value if number else None)
+    is_small = array.dtype.kind == "V" and jax.numpy.issubdtype(array.dtype, np.floating)
+    return array.astype(np.float32) if is_small else array  # such as bfloat16
 
 
 def two_digits(value: float, up: bool) -> str:
@@ -104,6 +108,10 @@ def require(name: str, value: Any, accepts: Callable, accepted: str) -> None:
     numbers = concrete_or_none(value)
     if numbers is None:
         return
+    if numbers.dtype.kind == "O":
+        reason = f"must be {accepted}, as a number or an array of numbers"
+        given = f"{short_repr(value)} of type {type(value).__name__}"
+        raise InputError(f"{name} {reason}, not {given}.", field=name, value=value, reason=reason)
     if numbers.dtype.kind not in "iuf" or numbers.size == 0 or not np.all(accepts(numbers)):
         raise refused(name, value, f"must be {accepted}")
 
@@ -119,7 +127,7 @@ def as_array(values: Any) -> Any:
     if isinstance(values, np.ndarray):  # compiled functions of JAX misread another byte order
         return values.astype(values.dtype.newbyteorder("="), copy=False)
     if not isinstance(values, (list, tuple)):
-        return values
+        return _as_number(values)
     if any(isinstance(x, (list, tuple)) for x in values):
         rows = [as_array(x) for x in values]
         alike = all(isinstance(x, np.ndarray) and x.shape == np.shape(rows[0]) for x in rows)
@@ -142,6 +150,19 @@ def require_native(name: str, tree: Any) -> None:
             f"{name} must have the byte order of this machine: "
             f"jax.tree.map(lambda x: x.astype(float), {name}) gives it."
         )
+
+
+def _as_number(value: Any) -> Any:
+    """A number or an array of another library as one of Python or NumPy; anything else unchanged,
+    as are masked arrays.
+    """
+    if isinstance(value, (Decimal, Fraction)):
+        return float(value)
+    known = isinstance(value, (np.ndarray, np.generic)) or type(value).__module__[:3] == "jax"
+    if known or not hasattr(value, "__array__") or is_traced(value):
+        return value
+    array = np.asarray(value)
+    return array if array.dtype.kind in "iuf" else value
 
 
 def require_number(name: str, value: Any, accepts: Callable, accepted: str) -> None:

@@ -146,12 +146,11 @@ _STATIC_FIELDS = tuple(f.name for f in fields(ShearFlow) if f.metadata.get("stat
 
 
 def _broadcast(flow: ShearFlow, shape: tuple[int, ...]) -> None:
-    """Give every number of a batch its axis of replicas, in the precision of those that have it
-    already.
+    """Give every number of a batch its axis of replicas, in JAX's default precision: that of
+    another number may be too low for it.
     """
     numbers = {name: getattr(flow, name) for name in _TRACED_FIELDS}
-    kind = jnp.result_type(*(value for value in numbers.values() if np.ndim(value)))
-    kind = kind if jnp.issubdtype(kind, jnp.floating) else jnp.result_type(float)
+    kind = jnp.result_type(float)
     for name, value in numbers.items():
         if np.ndim(value) == 0:
             traced = isinstance(value, Tracer)
@@ -181,6 +180,17 @@ jax.tree_util.register_pytree_with_keys(
     ),
     _unflatten,
 )
+
+
+def in_dtype(numbers: Any, dtype: Any) -> Any:
+    """The numbers of a flow or a batch, or a strain, in one dtype, so that one compiled program
+    serves numbers of Python, NumPy and JAX.
+    """
+
+    def cast(x: Any) -> Any:
+        return x.astype(dtype) if isinstance(x, Tracer) else np.asarray(x, dtype)
+
+    return jax.tree.map(cast, numbers)
 
 
 def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:

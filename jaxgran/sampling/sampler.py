@@ -30,6 +30,7 @@ from jaxgran.model.checks import (
 from jaxgran.model.flow import (
     ShearFlow,
     flow_of_state,
+    in_dtype,
     require_strain,
     steps_of_blocks,
     steps_of_strain,
@@ -123,16 +124,18 @@ def sample(
     require("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
     check = partial(_require_sheared_state, blocks)
     batch = checked_batch(check, flow, state, strain)
-    flow = flow_of_state(flow)
     numerics = checked_numerics(solver, engine)
     for name, function in (("observe", observe), ("callback", callback)):
         if function is not None and not callable(function):
             raise InputError(f"{name} must be a function or None, not {short_repr(function)}.")
     if callback is None:
         if batch is None:
+            flow, strain = in_dtype((flow_of_state(flow), strain), state.side.dtype)
             return waited(_sample(flow, state, strain, numerics, blocks, observe))
         option = "" if observe is None else "observe"
-        return shear_batch(_sample, numerics, batch, (blocks, observe), option)
+        flows, states, strains = batch
+        flows, strains = in_dtype((flow_of_state(flows), strains), states.side.dtype)
+        return shear_batch(_sample, numerics, (flows, states, strains), (blocks, observe), option)
     if is_traced(flow, numerics, state, strain):
         raise InputError("callback must be None where a sample is transformed, as by jax.jit.")
     replicas = batch or checked_batch(
