@@ -3,6 +3,7 @@ precision.
 """
 
 import hashlib
+import math
 import os
 import platform
 import subprocess
@@ -59,9 +60,21 @@ def processor_lines() -> list[str]:
     return information.read_text().splitlines() if information.is_file() else []
 
 
-def usable_cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def usable_cores(root: Path = Path("/sys/fs/cgroup")) -> int:
+    """Number of cores that this process may use: those of its affinity, or fewer where a control
+    group, such as that of a container, has a quota of processor time.
+    """
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
+    with suppress(OSError, ValueError):
+        own = Path("/proc/self/cgroup").read_text().rpartition("::")[2].strip().strip("/")
+        for folder in (root / own, *(root / own).parents):
+            if root not in (folder, *folder.parents):
+                break
+            with suppress(OSError):
+                quota, period = (folder / "cpu.max").read_text().split()
+                if quota != "max":
+                    cores = list(cores)[: max(1, math.ceil(int(quota) / int(period)))]
+    return len(cores) or os.cpu_count() or 1
 
 
 def usable_threads() -> int:
@@ -94,6 +107,14 @@ def devices() -> list[str]:
         raise RuntimeError(
             message or f"JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS')} has none"
         ) from failure
+
+
+def random_bits() -> str:
+    """The generator of random numbers, on whose flags in JAX the numbers depend."""
+    import jax
+
+    partitionable: bool = jax.config.jax_threefry_partitionable  # type: ignore[attr-defined]
+    return "threefry2x32" if partitionable else "threefry2x32, not partitionable"
 
 
 def default_device() -> Any:

@@ -7,6 +7,7 @@ leaves either the old file or the new one, never a part of one.
 import hashlib
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,17 +23,20 @@ _DIGEST = hashlib.sha256().digest_size  # bytes
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yield the path of a temporary file beside ``path``, which replaces ``path`` if the block
-    succeeds.
+    succeeds, and then has its permissions. Of a symbolic link, the file that it names is replaced.
 
     An OSError of the block names ``path``.
     """
-    temporary = path.with_name(f".{path.stem}-{secrets.token_hex(8)}{path.suffix}")
+    file = Path(os.path.realpath(path)) if path.is_symlink() else path
+    temporary = file.with_name(f".{file.stem}-{secrets.token_hex(8)}{file.suffix}")
     try:
         yield temporary
         _sync(temporary)
-        os.replace(temporary, path)
+        with suppress(FileNotFoundError, PermissionError):
+            shutil.copymode(file, temporary)
+        os.replace(temporary, file)
         if os.name == "posix":  # on other systems a folder cannot be opened
-            _sync(path.parent)
+            _sync(file.parent)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):

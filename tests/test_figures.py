@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 from drawn import contour_lines
 from made_up_maps import RATE, excess_of, ratio_dataset
-from matplotlib import _pylab_helpers, rcParams
+from matplotlib import _pylab_helpers, rc_context, rcParams
 from matplotlib.colors import same_color
 from matplotlib.container import ErrorbarContainer
 from matplotlib.contour import QuadContourSet
@@ -52,6 +52,15 @@ def with_stress_ratio(data: xr.Dataset) -> xr.Dataset:
     factors = xr.DataArray([[1.0, 2.0], [2.0, 1.0]], dims=("axis_a", "axis_b"))
     ratio, error = 1.0 + (data.force_ratio - 1.0) * factors, data.force_ratio_stderr * factors
     return data.assign(stress_ratio=ratio, stress_ratio_stderr=error)
+
+
+def test_a_users_style_for_tex_is_not_that_of_the_figures(tmp_path: Path) -> None:
+    with rc_context({"text.usetex": True, "savefig.bbox": "tight"}):
+        save_figures(ratio_dataset(3, 3), tmp_path / "tex")
+    save_figures(ratio_dataset(3, 3), tmp_path / "map")
+    for name in ("curves", "contours"):
+        same = (tmp_path / f"{x}_{name}.png" for x in ("tex", "map"))
+        assert len({path.read_bytes() for path in same}) == 1
 
 
 def test_contours_lie_on_the_isolines() -> None:

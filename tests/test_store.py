@@ -69,6 +69,18 @@ def test_what_is_no_file_of_ours_is_damaged(tmp_path: Path) -> None:
             read_arrays(tmp_path / name)
 
 
+def test_a_link_stays_a_link_and_permissions_stay(file: Path) -> None:
+    file.chmod(0o640)
+    folder = file.parent / "elsewhere"
+    folder.mkdir()
+    link = folder / "link.npz"
+    link.symlink_to(file)
+    write_arrays(link, {}, {})
+    assert link.is_symlink() and read_arrays(file) == ({}, {})
+    assert file.stat().st_mode & 0o777 == 0o640
+    assert list(folder.iterdir()) == [link]
+
+
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(file: Path) -> None:
     with pytest.raises(RuntimeError), atomic_write(file) as temporary:
         temporary.write_bytes(b"half")

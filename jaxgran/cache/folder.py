@@ -45,12 +45,14 @@ def use_cache() -> None:
 
 
 def programs_folder() -> Path | None:
-    """The folder where JAX caches compiled programs; None if it caches none."""
+    """The folder where JAX caches compiled programs; None if it caches none, or in a storage that
+    has an address, such as gs://bucket.
+    """
     import jax
 
     config: Any = jax.config
     folder = config.jax_enable_compilation_cache and config.jax_compilation_cache_dir
-    return Path(folder) if folder else None
+    return Path(folder) if folder and "://" not in folder else None
 
 
 def _silence_loader(config: Any) -> None:
@@ -84,8 +86,13 @@ def fallback_message() -> str:
 
 
 def users_folder() -> Path:
-    """The folder of this package in the user's cache folder; it need not exist."""
-    return user_cache_path("jaxgran")
+    """The folder of this package in the user's cache folder; it need not exist, as where the user
+    has no home.
+    """
+    try:
+        return user_cache_path("jaxgran")
+    except (RuntimeError, KeyError):
+        return Path("~/.cache/jaxgran")
 
 
 def cache_folder() -> Path | None:
@@ -97,6 +104,8 @@ def why_unwritable(folder: Path) -> str:
     """The reason why no file can be written to a folder, which is created if missing; "" if it is
     writable.
     """
+    if folder.parts[:1] == ("~",):
+        return "there is no home folder"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

@@ -162,6 +162,8 @@ def configured_jax():
     """JAX in double precision, with a cache of compiled programs."""
     import jax
 
+    if jax.config.jax_disable_jit:  # type: ignore[attr-defined]
+        raise InputError("flows are compiled: unset JAX_DISABLE_JIT.")
     jax.config.update("jax_enable_x64", True)
     say_cache()
     use_cache()

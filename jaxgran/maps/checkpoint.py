@@ -122,8 +122,9 @@ class Checkpoint:
     def _remove_leftovers(self) -> None:
         """Remove temporary files of a process that was killed while it wrote."""
         unique = "[0-9a-f]" * 16
-        beside = f".{glob.escape(self._output.stem)}-{unique}{self._output.suffix}"
-        for path in [*self._output.parent.glob(beside), *self.folder.glob(f".*-{unique}.npz")]:
+        file = Path(os.path.realpath(self._output))  # temporary files are beside it
+        beside = f".{glob.escape(file.stem)}-{unique}{file.suffix}"
+        for path in [*file.parent.glob(beside), *self.folder.glob(f".*-{unique}.npz")]:
             path.unlink(missing_ok=True)
 
     def _begin(self, resume: bool) -> None:

@@ -128,6 +128,7 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     platform, python, commit
     version_PACKAGE             version of jaxgran and of packages that the numbers depend on
     code_digest                 hash of the sources of jaxgran
+    random_bits                 generator of random numbers
     history, command            when and by what command the map was made
     automatic_choice            what was chosen by ``auto``, in words
     workers, resumed_replicas   number of threads, and of replicas that an earlier process left

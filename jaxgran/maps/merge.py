@@ -28,7 +28,7 @@ _LEFT_OUT = (
 )
 """Attributes of the maps that are not those of the merged one."""
 _SUMMED = ("wall_time_seconds", "resumed_replicas")
-_EQUAL = ("precision", "code_digest", *(f"version_{name}" for name in DECIDING))
+_EQUAL = ("precision", "code_digest", "random_bits", *(f"version_{name}" for name in DECIDING))
 
 
 def merge_maps(

@@ -1,5 +1,5 @@
-"""What the numbers of a map were computed with: precision, device, platform, versions, and a hash
-of the sources.
+"""What the numbers of a map were computed with: precision, device, platform, versions, generator of
+random numbers, and a hash of the sources.
 """
 
 import os
@@ -24,6 +24,7 @@ def made_with() -> dict[str, str]:
         "python": platform.python_version(),
         "commit": environment.commit(),
         "code_digest": sources_digest(),
+        "random_bits": environment.random_bits(),
         **{
             f"version_{name.replace('-', '_')}": number
             for name, number in environment.versions(_PACKAGES).items()
@@ -35,7 +36,7 @@ def versions_of(made: Mapping[str, str]) -> dict[str, str]:
     """The versions and sources on which the numbers depend, of what ``made_with`` returns or a file
     has.
     """
-    names = (*(f"version_{name}" for name in DECIDING), "code_digest")
+    names = (*(f"version_{name}" for name in DECIDING), "code_digest", "random_bits")
     return {name: made[name] for name in names if name in made}
 
 

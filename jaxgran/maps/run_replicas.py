@@ -13,6 +13,7 @@ from itertools import chain
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, UInt32
 
@@ -151,14 +152,16 @@ def _reporting(task: Sequence[Key], report: Callable[[Advance], None] | None) ->
 
 def random_key(replica: ReplicaId) -> UInt32[Array, "2"]:
     """The random key of a replica, as numbers: that of its seed, with the checksum of its flow
-    folded in.
+    folded in; by threefry2x32, whatever flags JAX has.
     """
     return _folded_key(replica.seed, np.uint32(replica.checksum))
 
 
 @persistent_jit
 def _folded_key(seed: Array, number: Array) -> UInt32[Array, "2"]:
-    return jax.random.key_data(jax.random.fold_in(jax.random.key(seed), number))
+    numbers = jnp.stack([jnp.uint32(0), jnp.asarray(seed, jnp.uint32)])  # as of jax.random.key
+    key = jax.random.wrap_key_data(numbers, impl="threefry2x32")
+    return jax.random.key_data(jax.random.fold_in(key, number))
 
 
 def _measured(

@@ -36,6 +36,9 @@ LABEL_SIZE = 8.0  # points, font of titles and of the labels of axes
 TICK_SIZE = 7.5  # points, font of the numbers at the ticks
 SMALL_SIZE = 7.0  # points, font of legends and captions
 STYLE: dict[Any, Any] = {
+    "text.usetex": False,  # texts are written for the letters of Matplotlib
+    "text.parse_math": True,
+    "savefig.bbox": None,  # the widths of figures are given
     "font.size": LABEL_SIZE,
     "axes.labelsize": LABEL_SIZE,
     "axes.titlesize": LABEL_SIZE,

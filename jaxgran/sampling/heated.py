@@ -107,7 +107,8 @@ def heat_replica(
     """A packing with Gaussian velocities of a given temperature and no total momentum; False if
     none was found.
     """
-    key = jax.random.wrap_key_data(key) if key.dtype == jnp.uint32 else key
+    if key.dtype == jnp.uint32:
+        key = jax.random.wrap_key_data(key, impl="threefry2x32")
     pack_key, heat_key = jax.random.split(key)
     state, packed = pack(flow, pack_key, grains)
     masses = state.grains.masses[:, None]

@@ -102,6 +102,9 @@ def _register() -> None:
 
 def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
     """Compile the numba engine, and write the object file if possible."""
+    for name, wrong in (("NUMBA_DISABLE_JIT", "1"), ("NUMBA_NUM_THREADS", "0")):
+        if os.environ.get(name, "").strip() == wrong:
+            raise InputError(f"{name}={wrong} keeps numba from compiling the engine: unset it.")
     from jaxgran.dynamics.numba_engine.handler import object_code
 
     content = object_code(TARGET, STOP, THREADS, machine)

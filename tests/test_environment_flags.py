@@ -1,0 +1,59 @@
+"""Flags and limits of the environment change no number, and end no command in a traceback."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from jaxgran.cache import folder
+from jaxgran.environment import random_bits, usable_cores
+from jaxgran.maps.replica import ReplicaId
+from jaxgran.maps.run_replicas import _folded_key, random_key
+
+REPLICA = ReplicaId(0.5, 0.6, 64, 1e-3, 3)
+
+
+@pytest.mark.parametrize(
+    ("flag", "value"), [("jax_default_prng_impl", "rbg"), ("jax_random_seed_offset", 7)]
+)
+def test_keys_do_not_depend_on_flags(flag: str, value, monkeypatch) -> None:
+    key = jax.random.fold_in(jax.random.key(3), np.uint32(REPLICA.checksum))
+    expected, before = jax.random.key_data(key), getattr(jax.config, flag)
+    np.testing.assert_array_equal(random_key(REPLICA), expected)
+    jax.config.update(flag, value)
+    try:
+        plain = _folded_key.__wrapped__(3, np.uint32(REPLICA.checksum))
+    finally:
+        jax.config.update(flag, before)
+    np.testing.assert_array_equal(plain, expected)
+
+
+def test_another_partition_of_random_bits_is_another_generator() -> None:
+    here = random_bits()
+    with jax.threefry_partitionable(not jax.config.jax_threefry_partitionable):
+        assert random_bits() != here
+
+
+def test_a_quota_of_one_core_is_one_thread(tmp_path: Path) -> None:
+    (tmp_path / "cpu.max").write_text("100000 100000\n")
+    assert usable_cores(tmp_path) == 1
+    (tmp_path / "cpu.max").write_text("max 100000\n")
+    assert usable_cores(tmp_path) == usable_cores()
+
+
+def test_a_cache_in_a_bucket_is_no_folder_here() -> None:
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", "gs://bucket/x")
+    try:
+        assert folder.programs_folder() is None
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_a_user_without_a_home_has_no_cache_there(monkeypatch) -> None:
+    def no_home(_: str) -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(folder, "user_cache_path", no_home)
+    assert folder.why_unwritable(folder.users_folder()) == "there is no home folder"
