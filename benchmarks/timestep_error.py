@@ -10,7 +10,7 @@ its standard error over all seeds.
 """
 
 import multiprocessing
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from itertools import product
 from typing import NamedTuple
@@ -23,6 +23,7 @@ import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.environment import usable_cores
 from jaxgran.sampling.sample import estimates
+from jaxgran.sampling.timestep import DEEPEST_OVERLAP, mean_gap, stress_error
 
 START = 1e-3  # time step of the steady state
 RELAXATION = 2.0  # strain at a new time step before its sample
@@ -69,6 +70,43 @@ def run(output: Output) -> None:
         seeds = [done[nu, alpha, seed] for seed in range(plan.seeds)]
         rows += rows_of_flow(plan, alpha, nu, seeds)
     output.write_rows("timestep_error", {"plan": plan._asdict()}, "rows", rows)
+
+
+def verdicts(rows: Sequence[Mapping]) -> dict:
+    """Which samples are off, and which of them some rules accuse, for the page of errors."""
+
+    def over_gap(row: Mapping) -> float:
+        return row["mean_overlap"] / mean_gap(row["packing_fraction"])
+
+    def bound(row: Mapping) -> float:
+        crossing = row["timestep"] * np.sqrt(row["temperature"])
+        return float(stress_error(crossing, row["packing_fraction"]))
+
+    finest = min(row["timestep"] for row in rows)
+    judged = [row for row in rows if row["timestep"] > finest]
+    off = [row for row in judged if abs(row["error"]) > ALLOWED + 2 * row["error_stderr"]]
+    rules = {
+        f"mean overlap over {100 * DEEPEST_OVERLAP:g} % of the mean gap": lambda row: (
+            over_gap(row) > DEEPEST_OVERLAP
+        ),
+        "mean overlap over 5 % of the mean gap": lambda row: over_gap(row) > 0.05,
+        "bound dt √(T/m)/σ over the mean gap above 5 %": lambda row: bound(row) > 0.05,
+        "over a tenth of the contacts deeper than 1e-2 σ": lambda row: row["deep_share"] > 0.1,
+        "over a thousandth of them": lambda row: row["deep_share"] > 1e-3,
+    }
+    return {
+        "samples": len(judged),
+        "off": len(off),
+        "beyond": max(abs(row["error"]) / bound(row) for row in off),
+        "rules": [
+            {
+                "words": words,
+                "hits": sum(map(accuses, off)),
+                "false": sum(accuses(row) and abs(row["error"]) <= ALLOWED for row in judged),
+            }
+            for words, accuses in rules.items()
+        ],
+    }
 
 
 def samples(plan: Plan, task: tuple[float, float, int]) -> dict[float, jg.Sample]:

@@ -115,12 +115,13 @@ def test_network_of_a_state_is_that_of_the_overlaps_by_brute_force(run, flowing)
     )
 
 
-def test_deep_overlap_is_reported(engine_run, scene):
-    for overlap, expected in ((0.02, Status.deep_overlap), (0.005, Status.ok)):
+def test_overlaps_are_summed_and_the_deepest_is_kept(engine_run, scene):
+    for overlap, deep in ((0.02, 1), (0.005, 0)):
         _, tally = engine_run(
             flow_of(0.02), scene([[5, 5], [6 - overlap, 5]], [[1.0, 0], [-1.0, 0]]), 1
         )
-        assert (tally.outcome, tally.status) == (expected, Status.ok)
+        assert (tally.deep_contacts, tally.contacts, tally.status) == (deep, 1, Status.ok)
+        np.testing.assert_allclose(tally.overlap, overlap, rtol=0, atol=8 * EPS)
         np.testing.assert_allclose(tally.largest_overlap, overlap, rtol=0, atol=8 * EPS)
 
 

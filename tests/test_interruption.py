@@ -27,9 +27,9 @@ def test_machine_code_that_is_stopped_ends_as_failed_and_runs_again(engines, flo
     end, whole = advance(FLOW, state, 1000, BarzilaiBorwein())
     with ffi.stopped():
         _, cut = advance(FLOW, state, 1000, BarzilaiBorwein())
-    assert cut.outcome == Status.failed and cut.steps < 1000
+    assert cut.status == Status.failed and cut.steps < 1000
     again, tally = advance(FLOW, state, 1000, BarzilaiBorwein())
-    assert tally.outcome == whole.outcome == Status.ok
+    assert tally.status == whole.status == Status.ok
     np.testing.assert_array_equal(again.positions, end.positions)
 
 

@@ -178,10 +178,8 @@ def test_steps_that_outrun_a_usual_skin_have_lists_as_wide_as_they_need(native_r
         grains,
         *(jnp.asarray(x, float) for x in (places, rng.normal(size=places.shape), 1.05 * row, 0.0)),
     )
-    assert (
-        native_run(ShearFlow(GRAINS, 0.5, 0.7, 0.05), state, 3, BarzilaiBorwein())[1].outcome
-        == Status.deep_overlap
-    )
+    _, tally = native_run(ShearFlow(GRAINS, 0.5, 0.7, 0.05), state, 3, BarzilaiBorwein())
+    assert tally.status == Status.ok and tally.deep_contacts > tally.contacts / 10
 
 
 def test_a_solve_of_nothing_has_no_residual(native_run) -> None:

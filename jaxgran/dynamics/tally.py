@@ -19,7 +19,6 @@ from jaxgran.contact.law import ContactTerms
 from jaxgran.model.batches import equal_values
 from jaxgran.model.indexing import taken
 from jaxgran.model.state import status_if_finite
-from jaxgran.model.status import DEEP_SHARE, Status, worse
 
 # What adds to a sum. The running sums of an engine stand in this order, and within it in the order
 # of the table.
@@ -127,14 +126,6 @@ class Tally:
     observed: Any = None  # sums of what a user's function observes, a pytree; None without one
 
     __eq__ = equal_values
-
-    @property
-    def outcome(self) -> Int[Array | np.ndarray, "*b"]:
-        """The status, or ``deep_overlap`` if that is worse and too large a share of the contacts
-        overlaps deeply.
-        """
-        deep = self.deep_contacts > DEEP_SHARE * self.contacts
-        return worse(self.status, deep, Status.deep_overlap)
 
     def __add__(self, other: "Tally") -> "Tally":
         return jax.tree.map(lambda *both: jnp.stack(both), self, other).total(axis=0)

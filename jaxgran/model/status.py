@@ -19,9 +19,7 @@ class Status(IntEnum):
         3  # the sample lasts only a few correlation strains, so its errors may be too small
     )
     not_steady = 4  # the flow was not shown to be steady
-    deep_overlap = (
-        5  # more than a tenth of the contacts overlapped by more than 1e-2 mean diameters
-    )
+    deep_overlap = 5  # contacts overlapped by too large a part of the gap between grains
     infeasible = 6  # no impulses satisfy the contact law: the packing is jammed
     capacity = 7  # more pairs or contacts than the buffers hold
     nonfinite = 8  # a number is not finite, or the packing fraction is not that of the state
@@ -29,8 +27,7 @@ class Status(IntEnum):
 
 
 GIVEN_UP = Status.infeasible  # from here on a replica is advanced no further, and has no averages
-DEEP_OVERLAP = 1e-2  # σ
-DEEP_SHARE = 0.1  # of the contacts; up to twice this share, stresses change by less than 2 %
+DEEP_OVERLAP = 1e-2  # σ, of a single contact
 # |Σ m c| over Σ m |c|, of which temperature and stresses contain about the square
 LARGEST_DRIFT = 1e-2
 
@@ -49,8 +46,8 @@ MEANINGS = {
     "small",
     "not_steady": "temperature, pressure or total momentum still drifted, sample longer, or "
     "prepare longer by `equilibrate`",
-    "deep_overlap": "more than a tenth of the contacts overlap by more than 1e-2 diameters, take a "
-    "shorter time step",
+    "deep_overlap": "contacts overlap by more than 2 % of the mean gap between grains on average, "
+    "so that the pressure may be off by more than 3 %, take a shorter time step",
     "infeasible": "no impulses satisfy the contact law, the packing is jammed, lower the packing "
     "fraction",
     "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",

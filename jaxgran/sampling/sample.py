@@ -21,7 +21,7 @@ from jaxgran.model.status import LARGEST_DRIFT, Status, worse
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.correlation_strain import flow_correlation_strain, mass_of_grains
 from jaxgran.sampling.observables import OBSERVABLES, Observables
-from jaxgran.sampling.timestep import stress_error
+from jaxgran.sampling.timestep import DEEPEST_OVERLAP, mean_gap, stress_error
 from jaxgran.statistics import (
     Estimates,
     correlation_length,
@@ -147,11 +147,16 @@ class Sample(Observables, Indexable):
 
     @property
     def status(self) -> Int[Array | np.ndarray, "*replicas"]:
-        """The worst status, see ``Tally.outcome``; ``short_sample`` below four correlation strains,
-        and ``not_steady`` if the total momentum has become a part of the averages.
+        """The worst status. It is ``short_sample`` below four correlation strains, ``not_steady`` if
+        the total momentum has become a part of the averages, and ``deep_overlap`` if contacts
+        overlap by more than ``DEEPEST_OVERLAP`` of the mean gap between grains on average.
         """
-        drifting = self._total.momentum_drift > LARGEST_DRIFT
-        return worse(self._total.outcome, drifting, Status.not_steady)
+        total, allowed = (
+            self._total,
+            DEEPEST_OVERLAP * mean_gap(in_numpy(self.flow).packing_fraction),
+        )
+        status = worse(total.status, total.overlap > allowed * total.contacts, Status.deep_overlap)
+        return worse(status, total.momentum_drift > LARGEST_DRIFT, Status.not_steady)
 
     @property
     def observed_sums(self) -> Any:
