@@ -48,6 +48,7 @@ def random_tally(rng: np.random.Generator, *shape: int, status: int = 0) -> Tall
         if name in counts:
             values[name] = np.ceil(values[name])
     values |= {name: np.zeros(shape) for name in ("deep_contacts", "momentum_drift")}
+    values["overlap"] *= 1e-4
     return Tally(**{**values, "status": np.full(shape, status, np.int32)})
 
 

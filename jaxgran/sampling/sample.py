@@ -147,15 +147,13 @@ class Sample(Observables, Indexable):
 
     @property
     def status(self) -> Int[Array | np.ndarray, "*replicas"]:
-        """The worst status. It is ``short_sample`` below four correlation strains, ``not_steady`` if
-        the total momentum has become a part of the averages, and ``deep_overlap`` if contacts
-        overlap by more than ``DEEPEST_OVERLAP`` of the mean gap between grains on average.
+        """The worst status: ``short_sample`` below four correlation strains, ``not_steady`` if the
+        total momentum has become a part of the averages, ``deep_overlap`` if contacts overlap by
+        more than ``DEEPEST_OVERLAP`` of the mean gap between grains on average.
         """
-        total, allowed = (
-            self._total,
-            DEEPEST_OVERLAP * mean_gap(in_numpy(self.flow).packing_fraction),
-        )
-        status = worse(total.status, total.overlap > allowed * total.contacts, Status.deep_overlap)
+        total, gap = self._total, mean_gap(in_numpy(self.flow).packing_fraction)
+        deep = total.overlap > DEEPEST_OVERLAP * gap * total.contacts
+        status = worse(total.status, deep, Status.deep_overlap)
         return worse(status, total.momentum_drift > LARGEST_DRIFT, Status.not_steady)
 
     @property

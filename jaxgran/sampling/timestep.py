@@ -37,9 +37,9 @@ JAMMING = 0.8386  # packing fraction where a random quench of diameters uniform 
 _LARGEST_CROSSING = 0.1  # largest motion in one step of a grain of thermal speed, in its diameters
 _COARSE_CROSSING = 0.03  # the same limit for the coarse time step
 # Mean overlap of the contacts over the mean gap, above which a sample has the status
-# ``deep_overlap``. Of 48 flows with time steps of 3e-4 to 1e-2 all 34 samples whose pressure was off
-# by more than 3 % beyond two standard errors exceed it, and 15 that were within 3 %. More than a
-# tenth of the contacts deeper than 1e-2 σ is true of 17 of the 34, and of 15 that were within 3 %
+# ``deep_overlap``. Of 48 flows with time steps of 3e-4 to 1e-2 all 34 samples whose pressure was
+# off by more than 3 % beyond two standard errors exceed it, and 15 that were within 3 %. More than
+# a tenth of the contacts were deeper than 1e-2 σ in 17 of the 34, and in 15 that were within 3 %
 # (``python -m benchmarks timestep_error``).
 DEEPEST_OVERLAP = 0.02
 _SMALLEST_DISTANCE = 1e-3  # smallest distance to jamming that enters a bound, in packing fraction
