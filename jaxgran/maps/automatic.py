@@ -46,7 +46,7 @@ _LEAST_SAMPLING_SHARE, _SAMPLING_SHARE = 0.2, 0.5
 _WARMEST = 2.0  # temperature over the expected one
 _SAFE: dict[str, Any] = {"grains": 256, "timestep": 1e-6}  # all flows accept these for "auto"
 _SIZES = np.rint(256 * 2 ** np.arange(0, 20, 0.5)).astype(int)  # few, as each one is compiled
-_SHORT_FLOATS = (np.float16, np.float32)
+_SHORT_FLOATS: tuple[Any, ...] = (np.float16, np.float32)
 PREPARED = 3.3  # correlation strains until most flows are steady
 SECONDS = 5e-7  # of processor time for a unit of ``predicted_cost``, at 1000 grains
 

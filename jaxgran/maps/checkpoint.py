@@ -152,7 +152,7 @@ class Checkpoint:
             here = made_with()
             by, where = "", "with the same parameters"
             if name in here:
-                other = code_name(begun | {key: str(text) for key, text in commit.items()})
+                other = code_name({name: str(text) for name, text in (begun | commit).items()})
                 by, where = f" was begun by {other}, and this is {code_name(here)}: it", "there"
             raise InputError(
                 f"the unfinished map in {str(self.folder)!r}{by} has {name} {begun_with!r}, not "

@@ -229,8 +229,10 @@ def _grows(data: xr.Dataset) -> bool:
     """Return whether the share grows with the excess: by ranks, over at least three points."""
     excess, share = data.force_ratio.values, data[_SHARE].values
     known = np.isfinite(excess) & np.isfinite(share)
-    ranks = [np.argsort(np.argsort(x[known])) for x in (excess, share)]
-    return known.sum() >= 3 and bool(np.corrcoef(ranks)[0, 1] > 0.5)
+    if known.sum() < 3:
+        return False
+    of_excess, of_share = (np.argsort(np.argsort(x[known])) for x in (excess, share))
+    return bool(np.corrcoef(of_excess, of_share)[0, 1] > 0.5)
 
 
 def _draw_shares(axes: Axes, data: xr.Dataset) -> int:
