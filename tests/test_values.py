@@ -103,6 +103,9 @@ def test_dataset_of_a_sample_has_its_averages_errors_and_units(one: Sample) -> N
         )
         assert ("standard deviation" in data[f"{name}_stderr"].long_name) == row.extreme
     np.testing.assert_array_equal(data.strain, one.strain)
+    for name in ("restitution", "packing_fraction", "timestep", "shear_rate"):
+        np.testing.assert_array_equal(data[name], getattr(one.flow, name))
+    assert data.attrs["version_jaxgran"] == jg.__version__ and "engine" in data.attrs
     assert (
         data.status.flag_meanings.split()[int(np.max(data.status))]
         == Status(int(np.max(one.status))).name

@@ -4,7 +4,7 @@ follow from them; see ``sampler`` for how it is taken.
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -71,14 +71,15 @@ def _computed_once(compute: Callable[["Sample"], T]) -> T:
 class Sample(Observables, Indexable):
     """A measured strain of one replica; a batch has a leading (replicas,) axis everywhere.
 
-    =====  =========  ====  =================================================
-    field  shape      unit  meaning
-    =====  =========  ====  =================================================
-    tally  (blocks,)  –     sums over the steps of each block of strain
-    area   ()         σ²    area of the cell
-    mass   ()         m     mass of all grains
-    flow   ShearFlow  –     parameters of the flow, in the precision of the sums
-    =====  =========  ====  =================================================
+    ======  =========  ====  =================================================
+    field   shape      unit  meaning
+    ======  =========  ====  =================================================
+    tally   (blocks,)  –     sums over the steps of each block of strain
+    area    ()         σ²    area of the cell
+    mass    ()         m     mass of all grains
+    flow    ShearFlow  –     parameters of the flow, in the precision of the sums
+    engine  static     –     name of the engine that ran; "" where it is not known
+    ======  =========  ====  =================================================
 
     Every observable is an attribute, such as ``sample.pressure``: the average over all blocks, in
     units of m, σ and the time unit t of the shear rate (1/γ̇ at the default γ̇ = 1). ``averages``
@@ -91,6 +92,7 @@ class Sample(Observables, Indexable):
     area: Float[Array | np.ndarray, "*replicas"]
     mass: Float[Array | np.ndarray, "*replicas"]
     flow: ShearFlow
+    engine: str = field(default="", metadata={"static": True})
 
     __eq__ = equal_values
 
@@ -190,8 +192,8 @@ class Sample(Observables, Indexable):
         return {name: np.stack([errors[name] for errors in of_replicas]) for name in of_replicas[0]}
 
     def to_dataset(self) -> "xr.Dataset":
-        """The averages as an ``xarray.Dataset``, named as in a map: NAME, NAME_stderr, and the
-        strain and the status.
+        """The averages as an ``xarray.Dataset``, named as in a map: NAME, NAME_stderr, the strain,
+        the status and the parameters of the flow. Its attributes say what ran.
 
         A batch has the dimension ``replica``, and tensors have ``axis_a`` and ``axis_b``.
         ``long_name`` says what a variable is. ``reduced_unit`` is its unit in m, σ and t. If

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import xarray as xr
 
+from jaxgran.environment import versions
 from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import OBSERVABLES, TENSOR_AXES, unit_attributes
@@ -13,6 +14,14 @@ from jaxgran.sampling.observe import dimensions_of
 
 if TYPE_CHECKING:
     from jaxgran.sampling.sample import Sample
+
+_PARAMETERS = {  # of a flow: what they are, and their units
+    "restitution": ("restitution", "1"),
+    "packing_fraction": ("packing fraction", "1"),
+    "timestep": ("time step", "t"),
+    "shear_rate": ("shear rate", "1 / t"),
+    "activation": ("part of a step of free flight after which an overlap is a contact", "1"),
+}
 
 
 def dataset_of(sample: "Sample") -> xr.Dataset:
@@ -24,6 +33,8 @@ def dataset_of(sample: "Sample") -> xr.Dataset:
         dims = (*replicas, *row.axes)
         variables[name] = dims, values[name], _about(row.meaning, row.unit)
         variables[f"{name}_stderr"] = dims, errors[name], _about(row.meaning_of_error, row.unit)
+    for name, (meaning, unit) in _PARAMETERS.items():
+        variables[name] = replicas, getattr(sample.flow, name), _about(meaning, unit)
     flags = {
         "flag_values": np.array([*Status], np.int8),
         "flag_meanings": " ".join(status.name for status in Status),
@@ -41,7 +52,13 @@ def dataset_of(sample: "Sample") -> xr.Dataset:
         )
     variables |= observed
     coordinates = {axis: ["x", "y"] for axis in TENSOR_AXES}
-    return xr.Dataset(variables, coordinates, {"grains": sample.flow.grains})
+    about = {
+        "grains": sample.flow.grains,
+        "engine": sample.engine,
+        "precision": str(np.asarray(sample.area).dtype),
+        **{f"version_{name}": number for name, number in versions(["jaxgran"]).items()},
+    }
+    return xr.Dataset(variables, coordinates, about)
 
 
 def _own_variables(sample: "Sample", replicas: tuple[str, ...]) -> dict[str, Any]:

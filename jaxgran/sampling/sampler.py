@@ -14,7 +14,7 @@ from jaxtyping import Array
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.advance import advance_blocks
 from jaxgran.dynamics.batch import Arguments, checked_batch, shear_batch
-from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
+from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics, select_engine
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.tally import Tally
 from jaxgran.environment import usable_threads
@@ -182,7 +182,8 @@ def _sample(
             steps,
         )
     numbers = jax.tree.map(lambda x: jnp.asarray(x, state.side.dtype), flow)
-    measured = Sample(tally, state.side**2, total_mass(state.grains), numbers)
+    engine = select_engine(flow, numerics, state, "" if observe is None else "observe").name
+    measured = Sample(tally, state.side**2, total_mass(state.grains), numbers, engine)
     return state, _with_length(measured)
 
 
@@ -196,9 +197,10 @@ def _sample_with_callback(
 ) -> tuple[State, Sample]:
     """The sample of a batch, or of a batch of a single replica, block by block."""
     flow, start, strain = batch
+    engine = select_engine(flow, numerics, start, "" if observe is None else "observe").name
 
     def result(end: State, tallies: Sequence[Tally]) -> tuple[State, Sample]:
-        measured = _with_length(sample_of_blocks(flow, end, tallies))
+        measured = _with_length(replace(sample_of_blocks(flow, end, tallies), engine=engine))
         return jax.tree.map(lambda x: jnp.asarray(x[0] if single else x), (end, measured))
 
     advance = partial(advance_batch, observe=observe, threads=usable_threads())
