@@ -24,6 +24,7 @@ from jaxgran.model.status import Status
 from jaxgran.sampling.heated import heated
 from jaxgran.sampling.packing import pack, require_room
 from jaxgran.sampling.prediction import size_classes
+from jaxgran.sampling.sampler import sample
 from jaxgran.sampling.steady_state import prepare
 from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
 
@@ -89,6 +90,13 @@ def test_a_flow_stays_apart_conserves_momentum_and_balances_its_energy(packed_ow
     assert work - tally.dissipation == pytest.approx(
         float(tally.energy_change), abs=1e-9 * float(tally.dissipation)
     )
+
+
+def test_evenly_spaced_diameters_are_no_polydispersity() -> None:
+    """The flow has the default one, which grains of one's own do not use."""
+    flow, grains = ShearFlow(16, 0.5, 0.6, 1e-3), own_grains(np.linspace(0.74, 1.26, 16))
+    state = prepare(flow, jax.random.key(0), equilibrate=0.1, grains=grains)
+    assert sample(flow, state, 0.1)[1].pressure > 0
 
 
 def test_masses_are_a_unit(packed_own, run):

@@ -71,8 +71,8 @@ class ShearFlow(Indexable):
     timestep          1/shear_rate = 1   dt, at most 0.1
     shear_rate        1/time             γ̇, 1e-100 to 1e100; 0 in free cooling, where the unit of
                                          time is free
-    polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ; not used with
-                                         ``own_grains``
+    polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ of the grains
+                                         that ``prepare`` makes; a state has its own grains
     activation        –                  θ, the part of a step of free flight after which grains
                                          that overlap are in contact: 0.5, given as "midpoint", or
                                          0, given as "touching"
