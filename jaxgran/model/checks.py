@@ -1,6 +1,7 @@
 """Checks of user input: an InputError says in one sentence what is accepted."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from decimal import Decimal
 from fractions import Fraction
 from reprlib import Repr
@@ -161,8 +162,10 @@ def _as_number(value: Any) -> Any:
     known = isinstance(value, (np.ndarray, np.generic)) or type(value).__module__[:3] == "jax"
     if known or not hasattr(value, "__array__") or is_traced(value):
         return value
-    array = np.asarray(value)
-    return array if array.dtype.kind in "iuf" else value
+    with suppress(TypeError, ValueError):  # such as a Dataset, which is no array
+        array = np.asarray(value)
+        return array if array.dtype.kind in "iuf" else value
+    return value
 
 
 def require_number(name: str, value: Any, accepts: Callable, accepted: str) -> None:
