@@ -243,10 +243,10 @@ BENCHMARKS = (
         (6, 0.5),
         ("coverage.json", "coverage_error.json", "coverage_short.json"),
         options=(
-            Option("--short", "judge samples of a strain of 2 to 50, of 64 grains", bool),
             Option(
                 "--error", "judge samples that end at this error, into coverage_error.json", float
             ),
+            Option("--short", "judge samples of a strain of 2 to 50, of 64 grains", bool),
         ),
         one_core=True,
     ),
