@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flows import GRAINS
+from flows import GRAINS, of_state
 
 from jaxgran.dynamics.batch import stack
 from jaxgran.dynamics.engine import Numerics
@@ -50,7 +50,7 @@ def batch(tmp_path: Path) -> Path:
     """A folder with the states of a batch and its results on the one device of this process."""
     states = [lattice(nu, seed) for seed, nu in enumerate((0.4, 0.5, 0.4, 0.5, 0.4, 0.5))]
     state = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-    flow = stack([ShearFlow(GRAINS, alpha, 0.6, 1e-3) for alpha in RESTITUTIONS])
+    flow = of_state(stack([ShearFlow(GRAINS, alpha, 0.6, 1e-3) for alpha in RESTITUTIONS]), state)
     assert jax.device_count() == 1
     numerics = Numerics()
     _save(tmp_path / "start.npz", (flow, numerics, state, np.asarray(STEPS, np.int32)))
