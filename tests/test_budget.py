@@ -69,6 +69,17 @@ def test_an_average_less_what_is_missing_is_the_one_at_its_number_of_grains() ->
     assert estimates["macroscopic_friction"].value == pytest.approx(friction)
 
 
+def test_size_errors_of_force_ratio_and_friction_are_shares_of_that_of_the_pressure() -> None:
+    """The excess of a force ratio has 1.2 times the error of the pressure and so has another tenth,
+    and the friction 0.9 times.
+    """
+    estimates = large(grains=256)
+    share = estimates["pressure"].size / estimates["pressure"].value
+    excess, friction = (estimates[name] for name in ("force_ratio", "macroscopic_friction"))
+    assert excess.size == pytest.approx(1.2 * share * (excess.value - 1 + 0.1))
+    assert friction.size == pytest.approx(0.9 * share * friction.value)
+
+
 def test_error_of_a_correction_falls_with_the_number_of_grains() -> None:
     sizes = 256 * 4 ** np.arange(6)
     for name in SIZE_LAWS:

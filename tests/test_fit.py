@@ -15,6 +15,7 @@ from synthetic import refused
 
 import jaxgran as jg
 from jaxgran.analysis.fit import TrajectoryFit
+from jaxgran.model.cell import displacement
 
 TRUTH, GUESS, WINDOWS, STEPS = 0.73, 0.5, 3, 500
 POSITION, VELOCITY = 1e-3, 1e-2  # standard deviations of the noise
@@ -37,6 +38,7 @@ def noisy(state: jg.State, seed: int) -> jg.State:
     return replace(state, positions=positions, velocities=state.velocities + velocities)
 
 
+@cache
 def fit(seed: int, steps: int = STEPS, **options) -> tuple[TrajectoryFit, jg.State]:
     start = starts()[seed * WINDOWS : (seed + 1) * WINDOWS]
     end, _ = jax.jit(jg.advance)(FLOW, start, jnp.int32(steps))
@@ -58,6 +60,21 @@ def test_restitution_is_found_within_its_error_bar() -> None:
             1, abs=0.5
         )
         assert result.velocities is None and result.positions is None
+
+
+def test_error_of_a_restitution_is_that_of_the_slopes_of_what_is_seen() -> None:
+    """By finite differences: 1/stderr² is the sum of the squared slopes over those of the noise."""
+    result, start = fit(0)
+    run, width = jax.jit(jg.advance), 0.01
+    low, high = (
+        run(replace(FLOW, restitution=result.restitution + x), start, jnp.int32(STEPS))[0]
+        for x in (-width, width)
+    )
+    sides, tilts = (jnp.asarray(x)[:, None] for x in (start.side, low.tilt))
+    moved = displacement(high.positions, low.positions, sides, tilts)
+    slopes = moved / POSITION, (high.velocities - low.velocities) / VELOCITY
+    information = sum(np.sum((np.asarray(x) / (2 * width)) ** 2) for x in slopes)
+    assert result.stderr * np.sqrt(information) == pytest.approx(1, rel=0.1)
 
 
 def test_states_at_the_start_are_found_better_than_they_were_seen_or_the_fit_is_refused() -> None:

@@ -28,10 +28,12 @@ from hypothesis import strategies as st
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics import advance as advance_module
+from jaxgran.dynamics import step
 from jaxgran.dynamics.engine import Jax, Numba, engine_named
 from jaxgran.dynamics.numba_engine import cluster_solver, layout
 from jaxgran.dynamics.numba_engine.ffi import object_file
 from jaxgran.dynamics.numba_engine.near_pairs import LIFE, closing_speed_bound, find_near_pairs
+from jaxgran.dynamics.step import LONGEST_FLIGHT
 from jaxgran.dynamics.tally import TABLE
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
@@ -168,6 +170,41 @@ def test_stiff_clusters_are_solved_as_by_the_plain_advance(run, native_run, heav
     assert ours[1].iterations > cluster_solver.SWEEPS
     np.testing.assert_allclose(ours[0].velocities, plain[0].velocities, atol=1e-7)
     np.testing.assert_allclose(ours[1].impulse, plain[1].impulse, rtol=1e-5)
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-5, 1e-7])
+def test_copies_of_a_cluster_are_solved_as_one_within_the_tolerance(native_run, tolerance) -> None:
+    """Each has its share of the permitted residual, which grows with the copies: the first takes
+    the iterations that it takes alone, and the others no more.
+    """
+    column, row = np.arange(GRAINS) % 8, np.arange(GRAINS) // 8
+    places = np.stack([2 + column * (1 - 1e-9), 5.0 * row + 2], axis=-1)
+    grains = Grains(jnp.asarray(np.full(GRAINS, 0.5)), jnp.ones(GRAINS))
+    tallies = []
+    for copies in (1, 2, 4):
+        velocities = np.zeros((GRAINS, 2))
+        velocities[(column == 0) & (row < copies), 0] = 1.0
+        state = State(grains, *(jnp.asarray(x, float) for x in (places, velocities, 40.0, 0.0)))
+        flow = flow_of(0.01, restitution=0.0, shear_rate=0.0)
+        tallies.append(native_run(flow, state, 1, BarzilaiBorwein(tolerance))[1])
+    assert tallies[0].iterations == tallies[1].iterations == tallies[2].iterations > 5
+    assert all(0 < tally.worst_residual <= tolerance for tally in tallies)
+
+
+def test_grains_that_a_collision_made_faster_meet_whatever_their_distance(native_run) -> None:
+    """Heavy grains strike two light ones, which meet head-on in the step in which another pair
+    collides; the list of near pairs was made for half of their speed.
+    """
+    places = np.stack([2 + 3.0 * (np.arange(GRAINS) % 12), 24 + 4.0 * (np.arange(GRAINS) // 12)])
+    masses, velocities = np.ones(GRAINS), np.zeros((GRAINS, 2))
+    masses[[0, 3]], velocities[[0, 3, 4], 0] = 1e4, [1, -1, 0.5]
+    flow = flow_of(0.02, restitution=1.0, shear_rate=0.0, timestep=1.44)
+    for gap in np.linspace(8.0, 8.64, 33)[:-1]:
+        places[:, :6] = [[5, 6, 7 + gap, 8 + gap, 5, 6.72], [5, 5, 5, 5, 15, 15]]
+        arrays = places.T, velocities, 40.0, 0.0
+        grains = Grains(jnp.asarray(np.full(GRAINS, 0.5)), jnp.asarray(masses))
+        after, _ = native_run(flow, State(grains, *map(jnp.asarray, arrays)), 2)
+        np.testing.assert_allclose(after.velocities[[1, 2], 0], [-2, 2], atol=1e-3, err_msg=gap)
 
 
 def test_steps_that_outrun_a_usual_skin_have_lists_as_wide_as_they_need(native_run) -> None:
@@ -307,6 +344,24 @@ def test_no_pair_closes_by_more_than_its_list_loses_of_the_skin(
     time = strain / shear_rate
     closed = distance - np.linalg.norm(apart + velocity * time)
     assert closed <= closing_speed_bound.py_func(fastest, shear_rate, distance) * time * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("speed", [0.3, 3.0])
+def test_bound_of_closing_includes_that_speeds_grow_within_a_flight(engine, speed) -> None:
+    """A pair that stretches with the shear reaches the skin at the end of the longest flight."""
+    longest, skin = {"numba": LIFE, "jax": LONGEST_FLIGHT}[engine], 0.2
+    normal = np.array([1, -1]) / np.sqrt(2)
+    velocities = speed * np.stack([-normal, normal])
+    later = velocities - longest * velocities[:, 1:] * [1, 0]
+    closing = np.dot(later[1] - later[0], normal) + (1 + skin) / 2
+    if engine == "numba":
+        bound = closing_speed_bound.py_func(speed, 1.0, 1 + skin)
+    else:
+        grains = Grains(jnp.full(2, 0.5), jnp.ones(2))
+        bound = step.closing_speed_bound(
+            ShearFlow(32, 0.5, 0.5, 1e-3), grains, jnp.asarray(velocities), jnp.asarray(skin)
+        )
+    assert closing <= bound <= closing + 2 * speed * longest
 
 
 @pytest.fixture(scope="module")

@@ -123,6 +123,13 @@ def test_temperature_is_kinetic_energy_over_2n(microscopic, measured) -> None:
     assert measured["granular_temperature"] == pytest.approx(np.mean(energies))
 
 
+def test_energy_of_the_longest_waves_is_a_share_of_equipartition(microscopic, measured) -> None:
+    """2.1 in each step, as a temperature."""
+    masses = microscopic["masses"][0]
+    energies = [np.sum(masses[:, None] * c**2) / (2 * GRAINS) for c in microscopic["velocities"]]
+    assert measured["longwave_energy_ratio"] == pytest.approx(2.1 / np.mean(energies))
+
+
 def test_counts_are_per_grain_and_step(microscopic, measured, tally) -> None:
     impulses, binary = microscopic["impulses"], microscopic["binary"]
     assert measured["coordination_number"] == pytest.approx(

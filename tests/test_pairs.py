@@ -150,6 +150,20 @@ def test_flag_of_the_outer_list_reaches_the_near_one(packed, monkeypatch):
     assert hood.outer.overflow and hood.near.overflow
 
 
+def test_an_overfull_cell_of_the_search_reaches_the_lists():
+    """More grains than a cell holds, whose pairs within the narrowest skin would fit."""
+    rng, count = np.random.default_rng(0), 600
+    grains = Grains(jnp.full(count, 0.5), jnp.ones(count))
+    side = np.sqrt(count * np.pi / 4 / 0.2)
+    positions = rng.uniform(size=(count, 2)) * side
+    assert not build(
+        jnp.asarray(positions), grains, jnp.asarray(side), jnp.asarray(0.0)
+    ).outer.overflow
+    positions[:140] *= 0.135
+    lists = build(jnp.asarray(positions), grains, jnp.asarray(side), jnp.asarray(0.0))
+    assert lists.outer.overflow and lists.near.overflow
+
+
 def test_near_list_filtered_after_large_shear_holds_every_pair_within_its_skin():
     """In dilute flow the skin is wider than a grain: shear then brings in pairs from farther than
     touching ones.
