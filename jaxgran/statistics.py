@@ -101,13 +101,13 @@ def standard_errors(
       >>> blocks = {"x": np.arange(1.0, 9.0)[None], "steps": np.ones((1, 8))}
       >>> value, error = standard_errors(lambda sums: {"mean": sums["x"] / sums["steps"]}, blocks)
       >>> float(value["mean"]), round(float(error["mean"]), 1)
-      (4.5, 2.4)
+      (4.5, 2.7)
     """
     whole, influence, scale, by_name = _influences(estimate, sums, lengths)
     if sum(map(len, influence)) < 2:
         return by_name(whole), by_name(np.full_like(whole, np.nan))
     expected = None
-    if lengths is not None and correlation is not None:
+    if lengths is not None and correlation is not None and np.max(lengths) > 0:
         expected = correlation / 2 * max(map(len, influence)) / np.max(lengths)
     half = _half_width(_posterior(influence, expected))
     return by_name(whole), by_name(scale * half / _NORMAL_QUANTILE)

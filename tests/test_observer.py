@@ -112,7 +112,7 @@ def test_error_of_a_ratio_is_that_of_the_ratio(observed) -> None:
         float(jnp.sum(sums["length"]) / jnp.sum(sums["pushes"]))
     )
     assert 0.9 < length["length"] < 1.1
-    assert 0 < error["length"] < 0.05
+    assert 0 < error["length"] < 0.1  # of a sample shorter than its correlation
 
 
 def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monkeypatch) -> None:

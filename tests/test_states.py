@@ -84,7 +84,7 @@ def kept(settings: MapSettings) -> dict[Key, Replica]:
     rng = np.random.default_rng(0)
     states = {(point, 0): random_state(point, 20 + point) for point in (0, 1, 3)}
     return {
-        (p, s): random_replica(rng, settings)._replace(state=states.get((p, s)))
+        (p, s): random_replica(rng, settings, point=p)._replace(state=states.get((p, s)))
         for p in range(4)
         for s in (0, 1)
     }

@@ -72,15 +72,15 @@ def two_digits(value: float, up: bool) -> str:
 _ROUNDING = 1e-5  # of a limit that is computed, stored in single precision or printed by ``:g``
 
 
-def at_most(value: Any, limit: Any) -> Any:
+def at_most(value: Any, limit: Any, rounding: float = _ROUNDING) -> Any:
     """Whether a value is at most a positive limit, but for the rounding of a message or of single
     precision.
 
     Examples:
-      >>> 0.007 <= 0.7 / 100, at_most(0.007, 0.7 / 100), at_most(np.float32(0.98), 0.98)
+      >>> 0.007 <= 0.7 / 100, at_most(0.007, 0.7 / 100), bool(at_most(np.float32(0.98), 0.98))
       (False, True, True)
     """
-    return value <= limit * (1 + _ROUNDING)
+    return value <= limit * (1 + rounding)
 
 
 _SHORT_REPR = Repr()

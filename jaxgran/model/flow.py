@@ -42,7 +42,7 @@ RANGES = {
     ),
     "timestep": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
     "shear_rate": (
-        lambda x: (x == 0) | (x >= 1 / _FASTEST) & (x <= _FASTEST),
+        lambda x: (x == 0) | (np.float64(x) >= 1 / _FASTEST) & (np.float64(x) <= _FASTEST),
         f"0 or between {1 / _FASTEST:g} and {_FASTEST:g}",
     ),
     "polydispersity": (lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),

@@ -14,6 +14,8 @@ from jaxgran.reference.table import LENGTH, MEASURED, Table, theory_of
 
 PLANE = ("restitution", "packing_fraction")
 
+_SINGLE = 1e-7  # rounding of a number in single precision
+
 
 class Estimate(NamedTuple):
     """Logarithms: of an average over the theory's prediction, of the prediction, and the half-width
@@ -116,7 +118,7 @@ def _checked(name: str, value: Any, low: float, high: float) -> np.ndarray:
         numbers = np.asarray(value, float)
     except (TypeError, ValueError):
         numbers = np.array(np.nan)
-    within = at_most(low, numbers) & at_most(numbers, high)
+    within = at_most(low, numbers, _SINGLE) & at_most(numbers, high, _SINGLE)
     if numbers.size == 0 or not np.all(within):
         wrong = numbers[~within].flat[0] if np.isfinite(numbers).any() else value
         raise refused(
