@@ -13,11 +13,12 @@ from jaxgran.sampling.budget import (
     LARGE_SYSTEM,
     SIZE_LAWS,
     SizeLaw,
+    jamming_error,
     large_system,
     sampling_target,
     size_error,
 )
-from jaxgran.sampling.timestep import stress_error
+from jaxgran.sampling.timestep import JAMMING, stress_error
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 MEASURED = {
@@ -89,10 +90,16 @@ def test_error_of_a_correction_falls_with_the_number_of_grains() -> None:
                 assert np.all(np.diff(errors) < 0) and 0 < errors[-1] < errors[0] < 1.5
 
 
+def test_error_of_jamming_falls_with_the_number_of_grains_and_the_distance_to_jamming() -> None:
+    near, far = JAMMING - 0.01, JAMMING - 0.1
+    assert jamming_error(far, 100) == pytest.approx(0.07)
+    assert jamming_error(near, 1600) == pytest.approx(10 * 0.07 / 32)
+
+
 def test_sampling_takes_what_the_other_parts_of_an_error_leave() -> None:
     """A sample at its target has the requested error, and one that cannot has a negative target."""
     values = MEASURED | {"contact_stress": 2.0 * np.eye(2), "shear_stress": 2 * 0.4}
-    tolerance, dt = 1e-4, 1e-3
+    tolerance, dt = 1e-3, 1e-3
     target = float(sampling_target(0.1, 0.5, 0.6, 1024, dt * np.sqrt(0.4), tolerance))
     errors = {name: target * np.asarray(x) for name, x in values.items()}
     reached = large_system(values, errors, 0.5, 0.6, 1024, dt, tolerance)

@@ -13,13 +13,15 @@ from flows import EXACT, GRAINS, of_state
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 from jax import lax
-from oracles import MAX_DISCS, delassus, padded_network, random_network
+from oracles import MAX_DISCS, build, delassus, padded_network, random_network
 
 from jaxgran.contact.delassus import grain_impulses
-from jaxgran.contact.network import Contacts
+from jaxgran.contact.near_pairs import Frame, present, separations_now
+from jaxgran.contact.network import Contacts, pair_motion
 from jaxgran.contact.projected_methods import BarzilaiBorwein, Nesterov
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics.jax_engine import advance_by_jax, count_events
+from jaxgran.dynamics.moving_contacts import displaced
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
@@ -323,6 +325,25 @@ def test_a_contact_that_moves_in_time_has_the_derivative_of_the_event(scene):
     (near, moving), (far, _) = value_and_slope(at, True), value_and_slope(at + change, True)
     np.testing.assert_allclose(moving, 0.75, atol=1e-9)
     np.testing.assert_allclose((far - near) / change, 0.75, atol=0.02)
+
+
+def test_displaced_grains_have_their_velocities_in_the_laboratory(flowing) -> None:
+    """Positions, frozen separations and pairs follow by the same displacement, in any frame."""
+    state, shift = flowing(0.6), 1e-3 * np.random.default_rng(0).normal(size=(GRAINS, 2))
+    lists = build(state.positions, state.grains, state.side, state.tilt)
+    lists = replace(lists, frame=Frame(jnp.zeros((GRAINS, 2)), jnp.asarray(0.3)))
+    near, before = lists.near, separations_now(lists.near, lists.frame)
+    pairs = pair_motion(near.i, near.j, before, state.velocities, 1.0)
+    frame, velocities, after = displaced(jnp.asarray(shift), 1.0, lists, state.velocities, pairs)
+    (old, tilt), (new, _) = (
+        present(replace(lists, frame=x), state.side) for x in (lists.frame, frame)
+    )
+    np.testing.assert_allclose(displacement(new, old, state.side, tilt), shift, atol=1e-12)
+    np.testing.assert_allclose(velocities - state.velocities, -shift[:, 1:] * [1, 0], atol=1e-12)
+    apart = shift[near.i] - shift[near.j]
+    np.testing.assert_allclose(separations_now(near, frame) - before, apart, atol=1e-9)
+    np.testing.assert_allclose(after.x - pairs.x, apart[:, 0], atol=1e-9)
+    np.testing.assert_allclose(after.y - pairs.y, apart[:, 1], atol=1e-9)
 
 
 def test_at_a_kink_the_derivative_is_one_of_the_two_one_sided_ones(scene):

@@ -82,6 +82,25 @@ def test_trajectory_and_sums_are_those_of_the_plain_advance(
     assert_same(ours, plain, 1e-6)
 
 
+@pytest.mark.parametrize(("rows", "steps"), [(10, 200), (25, 15)])
+def test_flows_of_more_grains_are_those_of_the_plain_advance(run, native_run, rows, steps) -> None:
+    """100 grains past a remap of the tilt, with several clusters in a step, each within the
+    tolerance; and 625, whose pairs are found by jax-md.
+    """
+    rng, count = np.random.default_rng(rows), rows * rows
+    radii, velocities = rng.uniform(0.45, 0.55, count), rng.normal(size=(count, 2))
+    velocities -= np.average(velocities, axis=0, weights=radii**2)
+    places = 1.11 * np.stack(np.divmod(np.arange(count), rows), axis=-1) + 0.1
+    arrays = places, velocities, 1.11 * rows, 0.4
+    state = State(Grains(*map(jnp.asarray, (radii, 4 * radii**2))), *map(jnp.asarray, arrays))
+    flow = of_state(ShearFlow(count, 0.5, 0.6, 5e-3), state)
+    ours, plain = native_run(flow, state, steps), run(flow, state, steps)
+    assert ours[1].status == Status.ok
+    assert ours[1].collisions > count / 5 and np.trace(ours[1].cluster_moment) > 0
+    assert max(ours[1].worst_residual, plain[1].worst_residual) <= EXACT.tolerance
+    assert_same(ours, plain, 1e-6)
+
+
 @settings(max_examples=30)
 @given(
     packing_fraction=st.sampled_from([0.1, 0.4, 0.7, 0.8]),

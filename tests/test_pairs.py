@@ -16,6 +16,7 @@ from jaxgran.contact import near_pairs
 from jaxgran.contact.near_pairs import (
     Frame,
     PairLists,
+    consumed_skin,
     first_true,
     pair_lists,
     present,
@@ -162,6 +163,16 @@ def test_an_overfull_cell_of_the_search_reaches_the_lists():
     positions[:140] *= 0.135
     lists = build(jnp.asarray(positions), grains, jnp.asarray(side), jnp.asarray(0.0))
     assert lists.outer.overflow and lists.near.overflow
+
+
+@pytest.mark.parametrize("strain", [-1.0, 0.0, 0.3])
+def test_motion_in_a_sheared_frame_consumes_the_skin_by_which_it_closes_gaps(strain):
+    """Two grains move towards each other along the direction that the shear stretches most."""
+    shear = np.array([[1, strain], [0, 1]])
+    moves = 0.1 * np.outer([1, -1], np.linalg.svd(shear)[2][0])
+    still, moved = (Frame(jnp.asarray(x), jnp.asarray(strain)) for x in (0 * moves, moves))
+    closed = np.linalg.norm(shear @ (moves[0] - moves[1]))
+    assert closed * (1 - 4 * EPS) <= consumed_skin(moved, still, jnp.asarray(1.0)) < 1.3 * closed
 
 
 def test_near_list_filtered_after_large_shear_holds_every_pair_within_its_skin():
