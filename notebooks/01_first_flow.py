@@ -57,7 +57,7 @@ flow
 # %%
 start = jg.heated(flow, jax.random.key(0), temperature=4.0)
 _, transient = jg.sample(flow, start, 6.0, blocks=60)
-blocks = averages(transient.tally, transient.area, grains, transient.shear_rate)
+blocks = averages(transient.tally, transient.area, grains, transient.flow.shear_rate)
 
 # %%
 figure, axes = plt.subplots(2, 1, figsize=(3.35, 3.6), sharex=True)
