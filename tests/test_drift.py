@@ -6,8 +6,10 @@ import numpy as np
 from synthetic import random_tally, sample_of_tally
 
 from jaxgran.model.flow import ShearFlow
+from jaxgran.sampling import drift
 from jaxgran.sampling.drift import is_drifting
 from jaxgran.sampling.sample import BLOCKS, Sample
+from jaxgran.sampling.thresholds import DRIFT_BLOCKS
 
 LATE = np.arange(BLOCKS) >= BLOCKS // 2
 
@@ -39,6 +41,17 @@ def test_seeds_that_drift_against_each_other_are_steady_together() -> None:
 
 def test_a_flow_of_long_correlation_may_wander() -> None:
     assert not is_drifting([sample_of(0, 1.3)], correlation_strain=100.0)
+
+
+def test_blocks_are_correlated_over_half_of_the_correlation_strain(monkeypatch) -> None:
+    """Of 16 blocks of a strain of one, and over a strain of one at least."""
+    given = []
+    monkeypatch.setattr(drift, "drift", lambda series, least: given.append(least) or (0.0, 0.0))
+    for strain in (0.5, 100.0):
+        assert not is_drifting([sample_of(0, 1.0)], strain)
+    blocks = BLOCKS / DRIFT_BLOCKS
+    expected = np.repeat(np.exp([-blocks, -blocks / 50]), 2)
+    np.testing.assert_allclose(given, expected)
 
 
 def test_a_sample_that_is_not_finite_drifts() -> None:
