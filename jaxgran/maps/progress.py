@@ -101,7 +101,8 @@ class Meter:
 
     def first_line(self) -> str:
         """The line before anything is done."""
-        expected = "" if math.isinf(self.seconds) else f", about {duration(self.seconds)} expected"
+        is_long = 1 <= self.seconds < math.inf
+        expected = f", about {duration(self.seconds)} expected" if is_long else ""
         return f"0/{len(self.left)} points, compiling{expected}"
 
     def _line(self) -> str:
