@@ -16,6 +16,7 @@ from jaxgran.dynamics import observed_advance
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.engine import Jax, Numba, Numerics
 from jaxgran.dynamics.observed_advance import advance_observed
+from jaxgran.dynamics.observer import Observed, middle_of_flight
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
@@ -196,3 +197,10 @@ def test_the_fewest_records_of_a_call_give_the_same_sums(flowing, observed, monk
     _, own = sample(FLOW, flowing(0.7), STRAIN, observe=lambda seen: observe(seen))
     same = partial(np.testing.assert_allclose, rtol=1e-14)  # XLA may add up in another order
     jax.tree.map(same, own.observed_sums, observed[1].observed_sums)
+
+
+@pytest.mark.parametrize(("step_observed", "middle"), [(0.0, 2.5), (1.0, 3.0)])
+def test_a_flight_is_observed_in_the_middle_of_its_steps_that_are_not_in_the_sums(
+    step_observed: float, middle: float
+) -> None:
+    assert middle_of_flight(Observed(None, jnp.asarray(step_observed)), jnp.int32(5)) == middle
