@@ -5,6 +5,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from command_line import in_a_process
 
 from jaxgran.cache import folder
 from jaxgran.environment import random_bits, usable_cores
@@ -57,3 +58,18 @@ def test_a_user_without_a_home_has_no_cache_there(monkeypatch) -> None:
 
     monkeypatch.setattr(folder, "user_cache_path", no_home)
     assert folder.why_unwritable(folder.users_folder()) == "there is no home folder"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("JAX_DISABLE_JIT", "1"), ("NUMBA_DISABLE_JIT", "1"), ("NUMBA_NUM_THREADS", "0")],
+)
+def test_flags_with_which_nothing_is_compiled_are_named(name, value, tmp_path, monkeypatch) -> None:
+    """By a user without a compiled engine on disk."""
+    monkeypatch.setenv(name, value)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    flow = ("--restitution", "0.5", "--packing-fraction", "0.5", "-n", "16")
+    done = in_a_process(tmp_path, "run", *flow, "--strain", "1", "--equilibrate", "0.1")
+    sentence = done.err.splitlines()[-1]
+    assert done.status == 2 and "Traceback" not in done.err
+    assert sentence.startswith("jaxgran: ") and name in sentence and sentence.endswith(".")
