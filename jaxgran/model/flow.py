@@ -290,13 +290,9 @@ def flow_of_state(flow: ShearFlow) -> ShearFlow:
     """
     if not is_traced(flow.packing_fraction):
         return flow
-    return _unflatten(
-        (flow.grains,),
-        (
-            _of_state(value) if name == "packing_fraction" else value
-            for name, value in ((name, getattr(flow, name)) for name in _TRACED_FIELDS)
-        ),
-    )
+    numbers = {name: getattr(flow, name) for name in _TRACED_FIELDS}
+    numbers["packing_fraction"] = _of_state(flow.packing_fraction)
+    return _unflatten((flow.grains,), numbers.values())
 
 
 def is_batch(flow: Any) -> bool:

@@ -181,9 +181,8 @@ def _sample(
             state,
             steps,
         )
-    numbers = jax.tree.map(lambda x: jnp.asarray(x, state.side.dtype), flow)
     engine = select_engine(flow, numerics, state, "" if observe is None else "observe").name
-    measured = Sample(tally, state.side**2, total_mass(state.grains), numbers, engine)
+    measured = Sample(tally, state.side**2, total_mass(state.grains), flow, engine)
     return state, _with_length(measured)
 
 
