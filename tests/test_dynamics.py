@@ -25,7 +25,7 @@ from oracles import gaps_of
 from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi
 from jaxgran.dynamics import jax_engine
 from jaxgran.dynamics.jax_engine import advance_by_jax, contact_buffers
-from jaxgran.dynamics.snapshots import contacts_now
+from jaxgran.dynamics.snapshot import contacts_now
 from jaxgran.dynamics.tally import TABLE
 from jaxgran.model.cell import displacement, remap_tilt
 from jaxgran.model.grains import Grains

@@ -12,12 +12,12 @@ import pytest
 from flows import GRAINS
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
-from jaxgran.dynamics import observed_advance
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.engine import Jax, Numba, Numerics
+from jaxgran.dynamics.numba_engine import observed as records
 from jaxgran.dynamics.observed_advance import advance_observed
 from jaxgran.dynamics.observer import Observed, middle_of_flight
-from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
+from jaxgran.dynamics.snapshot import Snapshot, snapshot_of
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.sample import BLOCKS
@@ -120,7 +120,7 @@ def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monke
     """With room for three, the numba engine is suspended after every other step with contacts, and
     takes none twice.
     """
-    monkeypatch.setattr(observed_advance, "_MOST_ROOM", 3)
+    monkeypatch.setattr(records, "_MOST_ROOM", 3)
     steps = jnp.int32(320)
     observing = jax.jit(lambda state: advance_observed(FLOW, Numerics(), state, steps, all_of_step))
     state, tally, own = observing(flowing(0.7))
@@ -193,7 +193,7 @@ def test_callback_is_refused_under_a_transformation(flowing) -> None:
 
 
 def test_the_fewest_records_of_a_call_give_the_same_sums(flowing, observed, monkeypatch) -> None:
-    monkeypatch.setattr(observed_advance, "_MOST_BYTES", 1)
+    monkeypatch.setattr(records, "_MOST_BYTES", 1)
     _, own = sample(FLOW, flowing(0.7), STRAIN, observe=lambda seen: observe(seen))
     same = partial(np.testing.assert_allclose, rtol=1e-14)  # XLA may add up in another order
     jax.tree.map(same, own.observed_sums, observed[1].observed_sums)

@@ -5,9 +5,7 @@ XLA calls the numba engine through its foreign function interface, so ``jit``, `
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +16,11 @@ from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.batch import checked_batch, over_replicas
 from jaxgran.dynamics.batching import with_forward_derivative, with_own_batching
 from jaxgran.dynamics.engine import Engine, Numba, Numerics, checked_numerics, select_engine
-from jaxgran.dynamics.jax_engine import advance_by_jax, ended, require_advance
-from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
-from jaxgran.model.checks import InputError
+from jaxgran.dynamics.jax_engine import advance_by_jax, require_advance
+from jaxgran.dynamics.tally import Tally
 from jaxgran.model.control_flow import in_batch
 from jaxgran.model.flow import ShearFlow, flow_of_state
-from jaxgran.model.state import State, kinetic_energy, status_at_start
+from jaxgran.model.state import State
 
 
 def advance(
@@ -149,34 +146,6 @@ def _jax_engine(moving_contacts: bool) -> Callable[..., tuple[State, Tally]]:
     return with_forward_derivative(lambda *arguments: batched(arguments), engine)
 
 
-def register_numba() -> None:
-    """Register the numba engine with XLA; it is compiled at its first use on a machine."""
-    from jaxgran.dynamics.numba_engine import ffi
-
-    ffi.register()
-
-
-def _advance_by_numba(
-    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
-) -> tuple[State, Tally]:
-    """Advance one replica with the numba engine."""
-    return _end_of(state, call_numba(flow, solver, state, steps[None]))
-
-
-def _blocks_by_numba(
-    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
-) -> tuple[State, Tally]:
-    """Advance one replica with the numba engine, by blocks of steps."""
-    call = call_numba(flow, solver, state, steps)
-    energies = jnp.concatenate([kinetic_energy(state.grains, state.velocities)[None], call.kinetic])
-    tallies = jax.vmap(lambda sums, **ends: sums.tally(**ends))(
-        call.sums, energy_change=jnp.diff(energies), momentum_drift=call.drift
-    )
-    end, last = _end_of(state, call)  # with the energy change of all blocks
-    last = replace(last, energy_change=last.energy_change - (energies[-2] - energies[0]))
-    return end, jax.tree.map(lambda all_blocks, x: all_blocks.at[-1].set(x), tallies, last)
-
-
 def _blocks_by_jax(
     flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
 ) -> tuple[State, Tally]:
@@ -184,119 +153,30 @@ def _blocks_by_jax(
     return lax.scan(lambda state, steps: advance_by_jax(flow, solver, state, steps), state, steps)
 
 
-def _end_of(state: State, call: "NumbaCall") -> tuple[State, Tally]:
-    """The state at the end of a call from a state, and the tally of its last block, with the whole
-    energy change.
-    """
-    sums = jax.tree.map(lambda x: x[-1], call.sums)
-    return ended(state, call.end.positions, call.end.tilt, call.end.velocities, sums)
+def _advance_by_numba(
+    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
+) -> tuple[State, Tally]:
+    """Advance one replica with the numba engine."""
+    end, tally = _blocks_by_numba(flow, solver, state, steps[None])
+    return end, jax.tree.map(lambda x: x[0], tally)
 
 
-class NumbaCall(NamedTuple):
-    """What a call of the numba engine returns.
+def _blocks_by_numba(
+    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
+) -> tuple[State, Tally]:
+    """Advance one replica with the numba engine, by blocks of steps."""
+    from jaxgran.dynamics.numba_engine.call import advance_by_numba
 
-    =========  ===============  ====================================================================
-    field      shape            meaning
-    =========  ===============  ====================================================================
-    end        State            the state at the end, unless the call is suspended
-    sums       RunningSums      (blocks,) the running sums, with those of the calls that it resumes
-    kinetic    (blocks,)        kinetic energy at the end of each block but the last one
-    drift      (blocks,)        relative momentum then
-    suspended  ()               where the call is suspended; 0 if it is finished
-    recorded   ()               number of records
-    records    (room, numbers)  see ``numba_engine.records``
-    memory     (words,)         memory of the engine, from which another call resumes; (0,) without
-                                records
-    =========  ===============  ====================================================================
-    """
-
-    end: State
-    sums: RunningSums
-    kinetic: Array
-    drift: Array
-    suspended: Array
-    recorded: Array
-    records: Array
-    memory: Array
+    return advance_by_numba(flow, solver, state, steps)
 
 
-def numba_memory(flow: ShearFlow) -> jax.ShapeDtypeStruct:
-    """The memory of the numba engine for one replica."""
-    from jaxgran.dynamics.numba_engine import layout
+def register_numba() -> None:
+    """Register the numba engine with XLA; it is compiled at its first use on a machine."""
+    from jaxgran.dynamics.numba_engine import call
 
-    return jax.ShapeDtypeStruct(
-        (1 + layout.WORDS + layout.WORDS_PER_GRAIN * flow.grains,), jnp.float64
-    )
+    call.register_numba()
 
 
 _numba_engine = with_forward_derivative(_advance_by_numba, advance_by_jax)
 _numba_blocks = with_forward_derivative(_blocks_by_numba, _blocks_by_jax)
 _jax_blocks = with_forward_derivative(with_own_batching(_blocks_by_jax), _blocks_by_jax)
-
-
-def call_numba(
-    flow: ShearFlow,
-    solver: ProjectedMethod,
-    state: State,
-    steps: Array,
-    room: int = 0,
-    suspended: Array | int = 0,
-    memory: Array | None = None,
-) -> NumbaCall:
-    """Run the numba engine once.
-
-    Args:
-      flow, solver, state: as in ``advance``.
-      steps: (blocks,) numbers of time steps.
-      room: number of records, static, for one block. The call is suspended where there is no room
-        for more; 0 records nothing.
-      suspended, memory: those of an earlier call with the same arguments, to resume it; 0 to begin.
-    """
-    from jaxgran.dynamics.numba_engine import layout
-    from jaxgran.dynamics.numba_engine.ffi import TARGET
-
-    register_numba()
-    dtype, grains = state.positions.dtype, state.grains
-    inputs = layout.Inputs(
-        side=state.side,
-        tilt=state.tilt,
-        restitution=flow.restitution,
-        timestep=flow.timestep,
-        shear_rate=flow.shear_rate,
-        tolerance=solver.tolerance,
-        activation=flow.activation,
-        max_steps=solver.max_steps,
-        status=status_at_start(flow, state),
-        resume_at=suspended,
-    )
-    shapes = [
-        state.positions.shape,
-        state.positions.shape,
-        (*steps.shape, layout.RESULTS),
-        numba_memory(flow).shape if room > 0 else (0,),  # without records no call is resumed
-        (room, layout.record_numbers(flow.grains)),
-    ]
-    results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
-    aliases = None if memory is None else {layout.MEMORY_GIVEN: layout.MEMORY}
-    call = jax.ffi.ffi_call(
-        TARGET, results, vmap_method="broadcast_all", input_output_aliases=aliases
-    )
-    operands = (
-        state.positions,
-        state.velocities,
-        grains.radii,
-        grains.masses,
-        jnp.stack([jnp.asarray(x).astype(dtype) for x in inputs]),
-        steps.astype(dtype),
-        *(() if memory is None else (memory,)),
-    )
-    kinds = {x.dtype.name for x in operands}
-    if kinds != {"float64"}:  # the engine reads doubles whatever it is given
-        raise InputError(f"the engine numba must be given float64 only, not {sorted(kinds)}.")
-    positions, velocities, blocks, memory, records = call(*operands)
-    last = blocks[-1]
-    end = State(grains, positions, velocities, state.side, last[layout.TILT])
-    sums = jax.vmap(sums_from_row)(blocks[:, :NUMBERS], blocks[:, layout.STATUS].astype(jnp.int32))
-    recorded = last[layout.RECORDED].astype(jnp.int32)
-    kinetic, drift = blocks[:, layout.KINETIC], blocks[:, layout.DRIFT]
-    return NumbaCall(end, sums, kinetic, drift, last[layout.SUSPENDED], recorded, records, memory)

@@ -24,7 +24,7 @@ from jaxgran.dynamics.batch import predicted_cost, run_batch
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.observed_advance import advance_observed
 from jaxgran.dynamics.observer import nothing_observed, without_contacts
-from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
+from jaxgran.dynamics.snapshot import Snapshot, snapshot_of
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.flow import ShearFlow

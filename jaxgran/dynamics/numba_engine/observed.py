@@ -1,0 +1,153 @@
+"""What a user's function observes while the numba engine advances a flow, from its records."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from jaxgran.contact.delassus import grain_impulses
+from jaxgran.contact.network import MOST_CONTACTS, Contacts
+from jaxgran.contact.projected_methods import ProjectedMethod
+from jaxgran.dynamics.jax_engine import ended
+from jaxgran.dynamics.numba_engine import layout
+from jaxgran.dynamics.numba_engine.call import NumbaCall, call_numba, numba_memory
+from jaxgran.dynamics.observer import Observe, added, nothing_observed, without_contacts
+from jaxgran.dynamics.snapshot import flown
+from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
+from jaxgran.model.cell import wrap
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
+
+_MOST_ROOM, _LEAST_ROOM = (
+    64,
+    2,
+)  # records of one call; the least are those of a list and of its first contacts
+_MOST_BYTES = 2**26  # of the records of one call, above 170,000 grains those of the least
+_FEW = 16  # grains for a slot in the smaller one of two buffers for contacts
+
+
+def records_of_call(grains: int) -> int:
+    """How many records a call of the numba engine keeps, within ``_MOST_BYTES``."""
+    return max(_LEAST_ROOM, min(_MOST_ROOM, _MOST_BYTES // (8 * layout.record_numbers(grains))))
+
+
+class _Progress(NamedTuple):
+    """An advance by one call of the numba engine after another, see ``NumbaCall``."""
+
+    unfinished: Array
+    end: State
+    sums: RunningSums
+    suspended: Array
+    memory: Array
+
+
+def observe_by_numba(
+    observe: Observe, flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
+) -> tuple[State, Tally, Any]:
+    """Advance one replica, and sum over all time steps what a function finds in them.
+
+    The engine does not call the function. It records the steps that it visits until the buffer of
+    records is full; then JAX applies the function to the records, and the engine goes on where it
+    was suspended. So only the function is compiled, not an engine, and the trajectory is that of
+    ``advance_by_numba`` to the bit.
+    """
+
+    room = records_of_call(flow.grains)
+
+    def called(now: _Progress) -> _Progress:
+        call = call_numba(flow, solver, state, steps[None], room, now.suspended, now.memory)
+        sums = jax.tree.map(lambda x: x[0], call.sums)
+        user_sums = _with_records(flow, state, observe, now.sums.user_sums, call, sums.steps)
+        sums = sums._replace(user_sums=user_sums)
+        return _Progress(call.suspended > 0, call.end, sums, call.suspended, call.memory)
+
+    dtype = state.positions.dtype
+    at_start = partial(observe, flow, state)
+    sums = empty_sums(dtype)._replace(
+        user_sums=nothing_observed(at_start, MOST_CONTACTS * flow.grains, dtype).sums
+    )
+    memory = jnp.zeros(numba_memory(flow).shape, dtype)
+    start = _Progress(jnp.bool_(True), state, sums, jnp.zeros((), dtype), memory)
+    end, sums = lax.while_loop(lambda now: now.unfinished, called, start)[1:3]
+    return *ended(state, end.positions, end.tilt, end.velocities, sums), sums.user_sums
+
+
+def _with_records(
+    flow: ShearFlow, state: State, observe: Observe, user_sums: Any, call: NumbaCall, steps: Array
+) -> Any:
+    """The user sums with what is found in the records of a call, up to the step ``steps``."""
+    records, count = call.records, call.recorded
+    dtype = records.dtype
+    timestep, shear_rate = (jnp.asarray(x, dtype) for x in (flow.timestep, flow.shear_rate))
+    most = MOST_CONTACTS * flow.grains
+    sizes = max(4, flow.grains // _FEW), most
+
+    def with_record(k: Array, user_sums: Any) -> Any:
+        record = records[k]
+        before = _recorded_state(record, state)
+
+        def with_contacts(slots: int) -> tuple[Any, Array]:
+            contacts, impulses = _recorded_contacts(record, state.grains, slots)
+            kicks = grain_impulses(contacts, impulses, flow.grains) / state.grains.masses[:, None]
+            return added(
+                user_sums, observe(flow, before, contacts, impulses), jnp.ones((), dtype)
+            ), kicks
+
+        size = jnp.sum(
+            record[layout.RECORD_CONTACTS] > jnp.asarray([0, *sizes[:-1]], dtype), dtype=jnp.int32
+        )
+        branches = [
+            lambda: (user_sums, jnp.zeros_like(before.velocities)),
+            *(partial(with_contacts, n) for n in sizes),
+        ]
+        sums, kicks = lax.switch(size, branches)
+        after = State(
+            state.grains, before.positions, before.velocities + kicks, state.side, before.tilt
+        )
+        until = jnp.where(
+            k + 1 < count, records[jnp.minimum(k + 1, len(records) - 1), layout.RECORD_STEP], steps
+        )
+        # The step whose contacts have acted, in this record or an earlier one, is no step of the
+        # flight.
+        flight, solved = until - record[layout.RECORD_STEP], record[layout.RECORD_SOLVED]
+        middle = flown(after, shear_rate, (flight + solved) / 2 * timestep)
+        weight = jnp.maximum(flight - solved, 0)
+        return added(sums, without_contacts(partial(observe, flow, middle), dtype), weight)
+
+    return lax.fori_loop(0, count, with_record, user_sums)
+
+
+def _recorded_state(record: Array, state: State) -> State:
+    """The state of a record, before its contacts act."""
+    tilt, count = record[layout.RECORD_TILT], state.grains.radii.size
+    numbers = record[layout.RECORD_HEAD : layout.RECORD_HEAD + layout.RECORD_OF_GRAIN * count]
+    motion = numbers.reshape(count, layout.RECORD_OF_GRAIN)
+    positions = wrap(motion[:, layout.RECORD_X : layout.RECORD_CX], state.side, tilt)
+    return State(state.grains, positions, motion[:, layout.RECORD_CX :], state.side, tilt)
+
+
+def _recorded_contacts(record: Array, grains: Grains, slots: int) -> tuple[Contacts, Array]:
+    """The contacts of a record and their impulses, in so many slots."""
+    first = layout.RECORD_HEAD + layout.RECORD_OF_GRAIN * grains.radii.size
+    rows = record[first : first + slots * layout.RECORD_OF_CONTACT].reshape(
+        slots, layout.RECORD_OF_CONTACT
+    )
+    used = jnp.arange(slots, dtype=record.dtype) < record[layout.RECORD_CONTACTS]
+    rows = jnp.where(used[:, None], rows, 0)  # what was never written may be anything
+    i = rows[:, layout.RECORD_I].astype(jnp.int32)
+    j = rows[:, layout.RECORD_J].astype(jnp.int32)
+    contacts = Contacts(
+        i=i,
+        j=j,
+        normals=rows[:, layout.RECORD_NX : layout.RECORD_APPROACH],
+        distances=jnp.where(used, rows[:, layout.RECORD_DISTANCE], 1),
+        approach=rows[:, layout.RECORD_APPROACH],
+        inverse_mass_i=jnp.where(used, 1 / grains.masses[i], 0),
+        inverse_mass_j=jnp.where(used, 1 / grains.masses[j], 0),
+        used=used,
+    )
+    return contacts, rows[:, layout.RECORD_IMPULSE]
