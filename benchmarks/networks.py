@@ -17,7 +17,7 @@ import numpy as np
 
 import jaxgran as jg
 from jaxgran.contact.network import Contacts
-from jaxgran.dynamics.snapshot import contacts_now
+from jaxgran.dynamics.snapshots import contacts_now
 
 SLOTS, GRAINS = (
     (32, 128, 256, 768, 3072),

@@ -12,9 +12,8 @@ from .contact.projected_methods import (
     ProjectedMethod,
 )
 from .contact.solve_contacts import solve_contacts
-from .dynamics.advance import advance
+from .dynamics.advance import advance, count_events
 from .dynamics.engine import Jax, Numba
-from .dynamics.jax_engine import count_events
 from .dynamics.snapshot import Snapshot
 from .dynamics.snapshots import snapshot_series
 from .dynamics.tally import Tally

@@ -13,9 +13,8 @@ from flows import GRAINS
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.advance import advance
-from jaxgran.dynamics.engine import Jax, Numba, Numerics
+from jaxgran.dynamics.engine import Jax, Numba
 from jaxgran.dynamics.numba_engine import observed as records
-from jaxgran.dynamics.observed_advance import advance_observed
 from jaxgran.dynamics.observer import Observed, middle_of_flight
 from jaxgran.dynamics.snapshot import Snapshot, snapshot_of
 from jaxgran.model.checks import InputError
@@ -122,8 +121,8 @@ def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monke
     """
     monkeypatch.setattr(records, "_MOST_ROOM", 3)
     steps = jnp.int32(320)
-    observing = jax.jit(lambda state: advance_observed(FLOW, Numerics(), state, steps, all_of_step))
-    state, tally, own = observing(flowing(0.7))
+    state, tally = jax.jit(lambda state: advance(FLOW, state, steps, observe))(flowing(0.7))
+    own, tally = tally.observed, replace(tally, observed=None)
     plain = jax.jit(lambda state: advance(FLOW, state, steps))(flowing(0.7))
     jax.tree.map(np.testing.assert_array_equal, (state, tally), plain)
     assert tally.solves == jnp.sum(observed[1].tally.solves) > 50
@@ -137,10 +136,9 @@ def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monke
 
 
 def test_engine_jax_observes_the_same(flowing, run) -> None:
-    numerics, state, steps = Numerics(engine=Jax()), flowing(0.7), jnp.int32(200)
-    end, tally, own = jax.jit(
-        lambda state: advance_observed(FLOW, numerics, state, steps, all_of_step)
-    )(state)
+    state, steps = flowing(0.7), jnp.int32(200)
+    end, tally = jax.jit(lambda state: advance(FLOW, state, steps, observe, engine=Jax()))(state)
+    own = tally.observed
     plain_end, plain_tally = run(FLOW, state, 200, solver=BarzilaiBorwein())
     np.testing.assert_allclose(end.velocities, plain_end.velocities, atol=1e-9)
     assert tally.solves == plain_tally.solves > 20
@@ -148,9 +146,7 @@ def test_engine_jax_observes_the_same(flowing, run) -> None:
     np.testing.assert_allclose(
         own["stress"] * FLOW.timestep * state.side**2, tally.contact_moment, rtol=1e-12
     )
-    _, _, recorded = jax.jit(
-        lambda state: advance_observed(FLOW, Numerics(), state, steps, all_of_step)
-    )(state)
+    recorded = jax.jit(lambda state: advance(FLOW, state, steps, observe))(state)[1].observed
     assert own.keys() == recorded.keys()
     for name in own:
         np.testing.assert_allclose(own[name], recorded[name], rtol=1e-3, atol=1e-3, err_msg=name)

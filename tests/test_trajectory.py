@@ -22,7 +22,7 @@ from synthetic import refused
 
 from jaxgran.dynamics.batch import stack
 from jaxgran.dynamics.engine import Numerics
-from jaxgran.dynamics.snapshot import snapshot
+from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.io import trajectory
 from jaxgran.io.trajectory import (
     Trajectory,

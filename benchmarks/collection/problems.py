@@ -18,7 +18,7 @@ from benchmarks import networks
 from benchmarks.collection.certificates import Problem
 from benchmarks.networks import Network
 from jaxgran.contact.network import Contacts
-from jaxgran.dynamics.snapshot import contacts_now
+from jaxgran.dynamics.snapshots import contacts_now
 
 POINTS = (  # restitution, packing fraction and time step of the flows
     (0.1, 0.60, 1e-3),

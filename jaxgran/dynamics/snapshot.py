@@ -13,11 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import grain_impulses
-from jaxgran.contact.near_pairs import bit_words, outer_pairs
-from jaxgran.contact.network import MOST_CONTACTS, Contacts, Touching, is_contact, pair_motion
-from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
-from jaxgran.contact.solver import solve
-from jaxgran.dynamics.step import closing_speed_bound
+from jaxgran.contact.network import Contacts
 from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.cell import remap_tilt, wrap
 from jaxgran.model.display import are_numbers, text_of
@@ -74,42 +70,6 @@ class Snapshot(Indexable):
     @property
     def _axes(self) -> tuple[int, ...]:
         return np.shape(self.state.side)
-
-
-def snapshot(flow: ShearFlow, state: State, solver: ProjectedMethod = DEFAULT_SOLVER) -> Snapshot:
-    """The snapshot of a flow now: the contact network of the next step is solved, and nothing
-    moves.
-    """
-    network, status = contacts_now(flow, state)
-    solution = solve(network, flow.grains, flow.shear_rate, solver, jnp.any(network.approach < 0))
-    restitution = jnp.asarray(flow.restitution, state.side.dtype)
-    return snapshot_of(
-        flow,
-        state,
-        network,
-        (1 + restitution) * solution.impulses,
-        jnp.maximum(status, solution.status),
-    )
-
-
-def contacts_now(flow: ShearFlow, state: State) -> tuple[Contacts, Int[Array, ""]]:
-    """The contact network that the next time step of a flow would solve, in a buffer that holds any
-    packing.
-
-    The status is ``capacity`` where contacts may be missing: a step looks further ahead than the
-    list of pairs, or has more contacts than discs that hardly overlap.
-    """
-    grains, velocities = state.grains, state.velocities
-    pairs = outer_pairs(state.positions, grains, state.side, state.tilt)
-    motion = pair_motion(pairs.i, pairs.j, pairs.separations, velocities, flow.shear_rate)
-    look_ahead = flow.activation * flow.timestep
-    contact, _ = is_contact(motion, pairs.reach, look_ahead)
-    room = MOST_CONTACTS * grains.radii.size
-    suffices = pairs.skin >= closing_speed_bound(flow, grains, velocities, pairs.skin) * look_ahead
-    missing = ~suffices | pairs.overflow | (jnp.sum(contact, dtype=jnp.int32) > room)
-    status = jnp.where(missing, Status.capacity, Status.ok).astype(jnp.int32)
-    touching = Touching(pairs.i, pairs.j, pairs.reach, motion, contact)
-    return touching.compacted(room, bit_words(contact)).network(grains), status
 
 
 def snapshot_of(

@@ -1,4 +1,4 @@
-"""Series of snapshots of a flow, at equal intervals of strain."""
+"""The snapshot of a flow now, and series of them at equal intervals of strain."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,18 +9,59 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
+from jaxgran.contact.near_pairs import bit_words, outer_pairs
+from jaxgran.contact.network import MOST_CONTACTS, Contacts, Touching, is_contact, pair_motion
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
-from jaxgran.dynamics.advance import advance
+from jaxgran.contact.solver import solve
+from jaxgran.dynamics.advance import advance_replica
 from jaxgran.dynamics.batch import checked_batch, shear_batch
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
-from jaxgran.dynamics.snapshot import Snapshot, snapshot
+from jaxgran.dynamics.snapshot import Snapshot, snapshot_of
+from jaxgran.dynamics.step import closing_speed_bound
 from jaxgran.model.checks import as_array, require, require_whole
 from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
 from jaxgran.model.state import State, require_state
+from jaxgran.model.status import Status
 
 _MOST_GRAIN_SNAPSHOTS = 10**9  # snapshots times grains of one series; memory is limited
+
+
+def snapshot(flow: ShearFlow, state: State, solver: ProjectedMethod = DEFAULT_SOLVER) -> Snapshot:
+    """The snapshot of a flow now: the contact network of the next step is solved, and nothing
+    moves.
+    """
+    network, status = contacts_now(flow, state)
+    solution = solve(network, flow.grains, flow.shear_rate, solver, jnp.any(network.approach < 0))
+    restitution = jnp.asarray(flow.restitution, state.side.dtype)
+    return snapshot_of(
+        flow,
+        state,
+        network,
+        (1 + restitution) * solution.impulses,
+        jnp.maximum(status, solution.status),
+    )
+
+
+def contacts_now(flow: ShearFlow, state: State) -> tuple[Contacts, Int[Array, ""]]:
+    """The contact network that the next time step of a flow would solve, in a buffer that holds any
+    packing.
+
+    The status is ``capacity`` where contacts may be missing: a step looks further ahead than the
+    list of pairs, or has more contacts than discs that hardly overlap.
+    """
+    grains, velocities = state.grains, state.velocities
+    pairs = outer_pairs(state.positions, grains, state.side, state.tilt)
+    motion = pair_motion(pairs.i, pairs.j, pairs.separations, velocities, flow.shear_rate)
+    look_ahead = flow.activation * flow.timestep
+    contact, _ = is_contact(motion, pairs.reach, look_ahead)
+    room = MOST_CONTACTS * grains.radii.size
+    suffices = pairs.skin >= closing_speed_bound(flow, grains, velocities, pairs.skin) * look_ahead
+    missing = ~suffices | pairs.overflow | (jnp.sum(contact, dtype=jnp.int32) > room)
+    status = jnp.where(missing, Status.capacity, Status.ok).astype(jnp.int32)
+    touching = Touching(pairs.i, pairs.j, pairs.reach, motion, contact)
+    return touching.compacted(room, bit_words(contact)).network(grains), status
 
 
 def snapshot_series(
@@ -82,7 +123,7 @@ def _later(
     flow: ShearFlow, numerics: Numerics, state: State, steps: Array
 ) -> tuple[State, Snapshot]:
     """The state after some time steps, and its snapshot with the worst status since."""
-    state, tally = advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
+    state, tally = advance_replica(flow, state, steps, numerics)
     new = snapshot(flow, state, numerics.solver)
     return state, replace(new, status=jnp.maximum(new.status, tally.status))
 

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.analysis.contacts import ForceNetwork, force_network
-from jaxgran.dynamics.snapshot import snapshot
+from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.model.choices import Activation
 from jaxgran.model.flow import ShearFlow

@@ -24,9 +24,14 @@ def register_numba() -> None:
 
 
 def advance_by_numba(
-    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Int[Array, " blocks"]
+    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Int[Array, "*blocks"]
 ) -> tuple[State, Tally]:
-    """Advance one replica by one block of steps after another, with a tally (blocks,) for each."""
+    """Advance one replica by a number of steps, or by one block of steps after another with a tally
+    (blocks,) for each.
+    """
+    if jnp.ndim(steps) == 0:
+        end, tally = advance_by_numba(flow, solver, state, jnp.asarray(steps)[None])
+        return end, jax.tree.map(lambda x: x[0], tally)
     call = call_numba(flow, solver, state, steps)
     energies = jnp.concatenate([kinetic_energy(state.grains, state.velocities)[None], call.kinetic])
     tallies = jax.vmap(lambda sums, **ends: sums.tally(**ends))(

@@ -1,5 +1,6 @@
 """What a user's function observes while the numba engine advances a flow, from its records."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -14,7 +15,13 @@ from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.jax_engine import ended
 from jaxgran.dynamics.numba_engine import layout
 from jaxgran.dynamics.numba_engine.call import NumbaCall, call_numba, numba_memory
-from jaxgran.dynamics.observer import Observe, added, nothing_observed, without_contacts
+from jaxgran.dynamics.observer import (
+    Observe,
+    added,
+    nothing_observed,
+    observe_at,
+    without_contacts,
+)
 from jaxgran.dynamics.snapshot import flown
 from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
 from jaxgran.model.cell import wrap
@@ -47,7 +54,7 @@ class _Progress(NamedTuple):
 
 def observe_by_numba(
     observe: Observe, flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
-) -> tuple[State, Tally, Any]:
+) -> tuple[State, Tally]:
     """Advance one replica, and sum over all time steps what a function finds in them.
 
     The engine does not call the function. It records the steps that it visits until the buffer of
@@ -66,14 +73,15 @@ def observe_by_numba(
         return _Progress(call.suspended > 0, call.end, sums, call.suspended, call.memory)
 
     dtype = state.positions.dtype
-    at_start = partial(observe, flow, state)
+    at_start = observe_at(observe, flow, state)
     sums = empty_sums(dtype)._replace(
         user_sums=nothing_observed(at_start, MOST_CONTACTS * flow.grains, dtype).sums
     )
     memory = jnp.zeros(numba_memory(flow).shape, dtype)
     start = _Progress(jnp.bool_(True), state, sums, jnp.zeros((), dtype), memory)
     end, sums = lax.while_loop(lambda now: now.unfinished, called, start)[1:3]
-    return *ended(state, end.positions, end.tilt, end.velocities, sums), sums.user_sums
+    after, tally = ended(state, end.positions, end.tilt, end.velocities, sums)
+    return after, replace(tally, observed=sums.user_sums)
 
 
 def _with_records(
@@ -93,9 +101,8 @@ def _with_records(
         def with_contacts(slots: int) -> tuple[Any, Array]:
             contacts, impulses = _recorded_contacts(record, state.grains, slots)
             kicks = grain_impulses(contacts, impulses, flow.grains) / state.grains.masses[:, None]
-            return added(
-                user_sums, observe(flow, before, contacts, impulses), jnp.ones((), dtype)
-            ), kicks
+            found = observe_at(observe, flow, before)(contacts, impulses)
+            return added(user_sums, found, jnp.ones((), dtype)), kicks
 
         size = jnp.sum(
             record[layout.RECORD_CONTACTS] > jnp.asarray([0, *sizes[:-1]], dtype), dtype=jnp.int32
@@ -116,7 +123,7 @@ def _with_records(
         flight, solved = until - record[layout.RECORD_STEP], record[layout.RECORD_SOLVED]
         middle = flown(after, shear_rate, (flight + solved) / 2 * timestep)
         weight = jnp.maximum(flight - solved, 0)
-        return added(sums, without_contacts(partial(observe, flow, middle), dtype), weight)
+        return added(sums, without_contacts(observe_at(observe, flow, middle), dtype), weight)
 
     return lax.fori_loop(0, count, with_record, user_sums)
 
