@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxgran.contact.delassus import grain_impulses
+from jaxgran.contact.delassus import NetworkOperator, grain_impulses
 from jaxgran.contact.near_pairs import bit_words, outer_pairs
 from jaxgran.contact.network import MOST_CONTACTS, Contacts, Touching, is_contact, pair_motion
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
@@ -91,7 +91,8 @@ def snapshot(flow: ShearFlow, state: State, solver: ProjectedMethod = DEFAULT_SO
     moves.
     """
     network, status = contacts_now(flow, state)
-    solution = solve(network, flow.grains, flow.shear_rate, solver, jnp.any(network.approach < 0))
+    operator, approaches = NetworkOperator(network, flow.grains), jnp.any(network.approach < 0)
+    solution = solve(operator, flow.shear_rate, solver, approaches)
     restitution = jnp.asarray(flow.restitution, state.side.dtype)
     return snapshot_of(
         flow,

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxgran.contact.delassus import NetworkOperator
 from jaxgran.contact.law import first_step, flight_of, kinetic_means
 from jaxgran.contact.near_pairs import (
     Frame,
@@ -341,11 +342,12 @@ def _collision(
 ) -> Collision:
     """What contacts do, from their network and its solution."""
     flow, grains = advance.flow, advance.grains
-    network, count = touching.network(grains), grains.radii.size
+    network = touching.network(grains)
+    operator = NetworkOperator(network, grains.radii.size)
     if single:
-        solution = single_contact(network, count)
+        solution = single_contact(operator)
     else:
-        solution = solve(network, count, flow.shear_rate, advance.solver, active)
+        solution = solve(operator, flow.shear_rate, advance.solver, active)
     impulses = impulses_of(flow, network, grains, solution)
     contact_sums, largest_overlap = sums_of_contacts(flow, touching.reach, network, impulses)
     user_sums, observe_now = now.sums.user_sums, observer_of(advance, now)
