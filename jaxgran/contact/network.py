@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxgran.contact.compaction import bit_positions
 from jaxgran.contact.law import gap_coefficients, overlaps_within, time_to_touch
-from jaxgran.contact.near_pairs import set_bits
 from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import relative_velocity
 from jaxgran.model.grains import Grains
@@ -160,13 +160,11 @@ class Touching(NamedTuple):
     contact: Bool[Array, " pairs"]
 
     def compacted(self, size: int, words: Array) -> "Touching":
-        """The first contacts in a buffer of a size; ``words`` are those of
-        ``bit_words(contact)``.
-        """
+        """The first contacts in a buffer of a size; ``words`` is ``pack_bits(contact)``."""
         pairs = self.contact.size
-        place = set_bits(words, size, pairs)
-        used = place < pairs
-        index = jnp.where(used, place, 0)
+        position = bit_positions(words, size, pairs)
+        used = position < pairs
+        index = jnp.where(used, position, 0)
         i, j, reach, motion = jax.tree.map(lambda x: taken(x, index), self[:-1])
         return Touching(i, j, reach, motion, used)
 
