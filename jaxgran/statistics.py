@@ -256,11 +256,11 @@ def _prior(expected: float | None) -> np.ndarray:
     correlation time is in blocks.
     """
     if expected is None:
-        of_times = np.log(_TIMES**0.25 / (1 + (_TIMES / _EXPECTED_TIME) ** 2))
+        log_prior = np.log(_TIMES**0.25 / (1 + (_TIMES / _EXPECTED_TIME) ** 2))
     else:
         centre = np.clip(_LONGER * expected, 1, _TIMES[-1])
-        of_times = -(np.log(_TIMES / centre) ** 2) / 2
-    return np.repeat(of_times, len(_WHITE_SHARES))
+        log_prior = -(np.log(_TIMES / centre) ** 2) / 2
+    return np.repeat(log_prior, len(_WHITE_SHARES))
 
 
 def _posterior(seeds: Sequence[np.ndarray], expected: float | None = None) -> _Posterior:

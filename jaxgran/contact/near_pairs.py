@@ -198,8 +198,8 @@ def widest_skin(grains: Grains, side: Array) -> Float[Array, ""]:
     """
     count, cutoff = grains.radii.size, side / 2
     if count > ALL_PAIRS_LIMIT:
-        of_grid = largest_cutoff(count, side, _capacity(OUTER_PAIRS_PER_GRAIN, count))
-        cutoff = jnp.minimum(cutoff, of_grid)
+        grid_cutoff = largest_cutoff(count, side, _capacity(OUTER_PAIRS_PER_GRAIN, count))
+        cutoff = jnp.minimum(cutoff, grid_cutoff)
     return cutoff - 2 * jnp.max(grains.radii)
 
 

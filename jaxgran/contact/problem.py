@@ -174,10 +174,10 @@ def as_problem(problem: ContactProblem) -> ContactProblem:
     """A contact problem that was checked, with all its numbers in one precision."""
     names = ("normals", "masses") if isinstance(problem, ContactNetwork) else ("matrix",)
     numbers = {name: getattr(problem, name) for name in (*names, "approach")}
-    kind = np.result_type(*(x.dtype for x in numbers.values()))
-    kind = kind if jnp.issubdtype(kind, jnp.floating) else np.float64
-    kind = jax.dtypes.canonicalize_dtype(kind)
-    return replace(problem, **{name: x.astype(kind) for name, x in numbers.items()})
+    common = np.result_type(*(x.dtype for x in numbers.values()))
+    is_float = jnp.issubdtype(common, jnp.floating)
+    dtype = jax.dtypes.canonicalize_dtype(common if is_float else np.float64)
+    return replace(problem, **{name: x.astype(dtype) for name, x in numbers.items()})
 
 
 def check_problem(problem: Any) -> None:
