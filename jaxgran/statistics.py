@@ -8,7 +8,7 @@ blocks are independent, and underestimates errors when few merged blocks are.
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -28,20 +28,6 @@ _NORMAL_QUANTILE = 1.959964
 _NEWTON_STEPS = 4
 _ROUNDING = 64 * np.finfo(float).eps  # of an estimate, to a scatter of the blocks that is none
 Estimates = dict[str, np.ndarray]
-
-
-class _Posterior(NamedTuple):
-    """Posterior of n means: a mixture of Student's t distributions, one for each of the (models,)
-    of the correlation.
-
-    ``weight``, ``shift`` (mean of a model minus the plain mean) and ``width`` (its scale) have
-    shape (models, n).
-    """
-
-    weight: np.ndarray
-    shift: np.ndarray
-    width: np.ndarray
-    freedom: int
 
 
 def standard_errors(
@@ -102,7 +88,7 @@ def standard_errors(
     expected = None
     if lengths is not None and correlation is not None and np.max(lengths) > 0:
         expected = correlation / 2 * max(map(len, influence)) / np.max(lengths)
-    half = _half_width(_posterior(influence, expected))
+    half = _half_width(*_posterior(influence, expected), sum(map(len, influence)) - 1)
     return by_name(whole), by_name(scale * half / _NORMAL_QUANTILE)
 
 
@@ -218,11 +204,13 @@ def _influences(
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
     counts = merged_blocks(lengths, seeds, min(blocks, _MOST_BLOCKS))
     total = int(counts.sum())
-    parts = jax.tree.map(lambda x: _joined(x, counts), sums)
-    rows = [lambda x: x.sum(axis=0)[None], *([_all_but_one] if total > 1 else [])]
-    flat, by_name = _flat(
-        estimate(jax.tree.map(lambda x: np.concatenate([row(x) for row in rows]), parts))
-    )
+
+    def whole_and_parts(x: np.ndarray) -> np.ndarray:
+        parts = _joined(x, counts)
+        whole = parts.sum(axis=0)[None]
+        return np.concatenate([whole, _all_but_one(parts)]) if total > 1 else whole
+
+    flat, by_name = _flat(estimate(jax.tree.map(whole_and_parts, sums)))
     without = flat[1:].astype(float) if total > 1 else np.full(flat.shape, np.nan)
     influence = (total - 1) * (without.mean(axis=0) - without)
     scale = np.sqrt(np.mean(influence**2, axis=0))
@@ -263,9 +251,15 @@ def _prior(expected: float | None) -> np.ndarray:
     return np.repeat(log_prior, len(_WHITE_SHARES))
 
 
-def _posterior(seeds: Sequence[np.ndarray], expected: float | None = None) -> _Posterior:
+def _posterior(
+    seeds: Sequence[np.ndarray], expected: float | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Posterior of n means from series (blocks, n) of plain mean zero, one a seed; see
     ``standard_errors``.
+
+    Returns:
+      Weight of each model of the correlation, mean in it less the plain mean, and scale of its
+      Student's t distribution, (models, n) each.
     """
     prior = _prior(expected)[:, None]
     shape, freedom = (len(prior), seeds[0].shape[1]), sum(map(len, seeds)) - 1
@@ -284,14 +278,15 @@ def _posterior(seeds: Sequence[np.ndarray], expected: float | None = None) -> _P
     log_weight = prior - (determinant + np.log(information) + freedom * np.log(residual)) / 2
     weight = np.exp(log_weight - log_weight.max(axis=0))
     width = np.sqrt(residual / (freedom * information))
-    return _Posterior(weight / weight.sum(axis=0), shift, width, freedom)
+    return weight / weight.sum(axis=0), shift, width
 
 
-def _half_width(posterior: _Posterior) -> np.ndarray:
+def _half_width(
+    weight: np.ndarray, shift: np.ndarray, width: np.ndarray, freedom: int
+) -> np.ndarray:
     """Half-width (n,) of the interval around zero that contains a mean with probability
-    ``_LEVEL``, by Newton's method.
+    ``_LEVEL``, by Newton's method, from the mixture of ``_posterior``.
     """
-    weight, shift, width, freedom = posterior
     special: Any = scipy.special
     quantile = special.stdtrit(freedom, (1 + _LEVEL) / 2)
     highest = 1 / (np.sqrt(freedom) * special.beta(freedom / 2, 0.5))  # density at zero

@@ -129,15 +129,14 @@ def solve(
     capped = active & ~(end.residual <= target)
     jammed = lax.cond(any_replica(capped), is_jammed, lambda: jnp.bool_(False))
     failure = jnp.where(jammed, Status.infeasible, Status.iteration_limit)
-    status = jnp.where(capped, failure, Status.ok)
+    nonfinite = active & ~jnp.isfinite(end.at.best_residual)
+    status = jnp.where(nonfinite, Status.nonfinite, jnp.where(capped, failure, Status.ok))
     return Solution(
         impulses=impulses,
         response=response,
         residual=jnp.where(active, relative_residual(end.at.best_residual, scale, target), 0),
         iterations=end.at.iterations,
-        status=jnp.where(
-            active & ~jnp.isfinite(end.at.best_residual), Status.nonfinite, status
-        ).astype(jnp.int32),
+        status=status.astype(jnp.int32),
     )
 
 
