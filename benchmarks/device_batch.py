@@ -22,7 +22,8 @@ import jaxgran as jg
 from benchmarks.independent import contact_dynamics
 from benchmarks.output import Output
 from benchmarks.step_cost import rival_arguments
-from jaxgran.dynamics.engine import DEFAULT_NUMERICS, in_lockstep, select_engine
+from jaxgran.dynamics.batching import in_lockstep
+from jaxgran.dynamics.engine import DEFAULT_NUMERICS, select_engine
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.observe import advance_batch
 
@@ -102,7 +103,7 @@ def compare(flow: jg.ShearFlow, replicas: int) -> dict:
                 on_device = pressure(result[1], flow, distinct[0])[: len(distinct)]
     speeds = {name: done / min(seconds[name][1:]) for name, (_, done) in ways.items()}
     return {
-        "engine": select_engine(flow, DEFAULT_NUMERICS).name,
+        "engine": select_engine(DEFAULT_NUMERICS).name,
         **speeds,
         "ratio": speeds["device"] / speeds["rival"],
         "pressure": float(np.mean(on_device) / np.mean(pressures)),

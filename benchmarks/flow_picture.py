@@ -19,7 +19,7 @@ from matplotlib.patches import Patch
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.analysis.contacts import ForceNetwork, cluster_share, clusters
-from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.plotting.flow import (
     Colour,
     add_colour_bar,

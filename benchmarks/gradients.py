@@ -52,7 +52,8 @@ def cost(grains: int, alpha: float, nu: float) -> dict:
     def energy(restitution, velocities, number: int | None, steps: int = STEPS):
         start = replace(state, velocities=velocities)
         changed = replace(flow, restitution=restitution)
-        end, _ = jg.advance(changed, start, jnp.int32(steps), True, number, solver=SOLVER)
+        engine = None if number is None else jg.Jax(events=number)
+        end, _ = jg.advance(changed, start, jnp.int32(steps), solver=SOLVER, engine=engine)
         return jnp.sum(end.velocities**2)
 
     at = (jnp.asarray(alpha), state.velocities)
@@ -144,9 +145,8 @@ def growth(flow, state, moving_contacts: bool):
         def end(alpha, positions, velocities, tilt):
             start = replace(carry[0], positions=positions, velocities=velocities, tilt=tilt)
             changed = replace(flow, restitution=alpha)
-            later, _ = jg.advance(
-                changed, start, steps, moving_contacts=moving_contacts, solver=SOLVER
-            )
+            engine = jg.Jax(moving_contacts=moving_contacts)
+            later, _ = jg.advance(changed, start, steps, solver=SOLVER, engine=engine)
             return later.positions, later.velocities, later.tilt
 
         now, change = carry

@@ -117,7 +117,8 @@ def gradient(start: tuple[jg.ShearFlow, jg.State]) -> dict:
     events = int(jnp.max(count(flows, states, steps)))
 
     def energy(restitution):
-        end, _ = jg.advance(replace(flows, restitution=restitution), states, steps, events=events)
+        changed, engine = replace(flows, restitution=restitution), jg.Jax(events=events)
+        end, _ = jg.advance(changed, states, steps, engine=engine)
         return jnp.mean(jnp.sum(end.velocities**2, axis=(1, 2)))
 
     seconds, memory, program = compiled(jax.jit(jax.grad(energy)), flows.restitution)

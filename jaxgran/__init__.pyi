@@ -12,10 +12,10 @@ from .contact.projected_methods import (
     ProjectedMethod,
 )
 from .contact.solve_contacts import solve_contacts
-from .dynamics.advance import advance
+from .dynamics.advance import advance, count_events
 from .dynamics.engine import Jax, Numba
-from .dynamics.jax_engine import count_events
-from .dynamics.snapshots import Snapshot, snapshot_series
+from .dynamics.snapshot import Snapshot
+from .dynamics.snapshots import snapshot_series
 from .dynamics.tally import Tally
 from .io.trajectory import read_trajectory, write_trajectory
 from .maps.merge import merge_maps

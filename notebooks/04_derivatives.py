@@ -54,7 +54,7 @@ events = int(jg.count_events(flow, state, steps, solver=solver))
 def energy(restitution):
     """Peculiar kinetic energy after the steps, in mσ²γ̇²."""
     later = replace(flow, restitution=restitution)
-    end, _ = jg.advance(later, state, steps, events=events, solver=solver)
+    end, _ = jg.advance(later, state, steps, solver=solver, engine=jg.Jax(events=events))
     return jnp.sum(end.grains.masses[:, None] * end.velocities**2) / 2
 
 

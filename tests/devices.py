@@ -1,34 +1,39 @@
-"""Advance a batch from a file on all devices of JAX, here or of two hosts, and write what comes
-out.
+"""Advance replicas on one device and, by the recipe of the pages, on all four; the same bits.
 
-python devices.py START.npz OUTPUT.npz GRAINS [lockstep | COORDINATOR HOST]
+python devices.py [lockstep]
 """
 
 import sys
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from flows import flow_of
+from jax.sharding import Mesh, PartitionSpec
+from test_batching import assert_same
 
-start, output, grains, *host = sys.argv[1:]
+import jaxgran as jg
+from jaxgran.dynamics import batching, engine
+
 jax.config.update("jax_enable_x64", True)
+if sys.argv[1:] == ["lockstep"]:
+    for module in (batching, engine):
+        module.default_device = lambda: SimpleNamespace(platform="accelerator")
 
-from jaxgran.dynamics import engine  # noqa: E402
+alphas = jnp.asarray([0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.2, 0.4])
+flows = flow_of(0.7, restitution=alphas)
+states = jax.device_get(jg.heated(flows, jax.random.split(jax.random.key(0), len(alphas))))
 
-if host == ["lockstep"]:
-    engine.default_device = lambda: SimpleNamespace(platform="accelerator")
-elif host:
-    jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    jax.distributed.initialize(host[0], 2, int(host[1]))
 
-from jaxgran.dynamics.engine import Numerics  # noqa: E402
-from jaxgran.model.flow import ShearFlow  # noqa: E402
-from jaxgran.model.grains import Grains  # noqa: E402
-from jaxgran.model.state import State  # noqa: E402
-from jaxgran.sampling.observe import advance_batch  # noqa: E402
+@jax.vmap
+def advanced(alpha, state):
+    return jg.advance(flow_of(0.7, restitution=alpha), state, jnp.int32(100))
 
-like = (ShearFlow(int(grains), 0.5, 0.6, 1e-3), Numerics(), State(Grains(0, 0), 0, 0, 0, 0), 0)
-with np.load(start) as arrays:
-    leaves = [arrays[name] for name in arrays.files]
-state, tally = advance_batch(*jax.tree.unflatten(jax.tree.structure(like), leaves))
-np.savez(output, *[np.asarray(leaf) for leaf in jax.tree.leaves((state, tally))])
+
+mesh, share = Mesh(np.asarray(jax.devices()), ("device",)), PartitionSpec("device")
+on_all = jax.shard_map(advanced, mesh=mesh, in_specs=share, out_specs=share, check_vma=False)
+assert jax.device_count() == 4
+one, four = (jax.jit(run)(alphas, states) for run in (advanced, on_all))
+assert np.all(np.asarray(one[1].collisions) > 0)
+assert_same(one, four)

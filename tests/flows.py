@@ -108,7 +108,7 @@ def run():
     """``run(flow, state, steps, free_flight=True, solver=EXACT)``: the advance by JAX alone,
     compiled.
     """
-    compiled = jax.jit(advance_by_jax)
+    compiled = jax.jit(advance_by_jax, static_argnames="free_flight")
 
     def call(
         flow: ShearFlow,
@@ -119,7 +119,7 @@ def run():
     ):
         return jax.block_until_ready(
             compiled(
-                of_state(flow, state), solver, state, jnp.int32(steps), jnp.asarray(free_flight)
+                of_state(flow, state), solver, state, jnp.int32(steps), free_flight=free_flight
             )
         )
 

@@ -13,7 +13,7 @@ from flows import GRAINS, flow_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxgran.dynamics.advance import advance_blocks
+from jaxgran.dynamics.advance import advance_replica
 from jaxgran.dynamics.engine import Numerics, engine_named
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
@@ -57,7 +57,7 @@ def of_numbers(numbers: dict) -> tuple[ShearFlow, State]:
 def advanced(numbers: dict) -> tuple:
     flow, state = of_numbers(numbers)
     numerics = Numerics(engine=engine_named(sys.argv[1]))
-    return advance_blocks(flow, numerics, state, jnp.asarray([STEPS // 3] * 3, jnp.int32))
+    return advance_replica(flow, state, jnp.asarray([STEPS // 3] * 3, jnp.int32), numerics)
 
 
 @settings(max_examples=500, database=None)

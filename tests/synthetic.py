@@ -11,7 +11,7 @@ import pytest
 
 from jaxgran.analysis.contacts import ForceNetwork
 from jaxgran.contact.network import Contacts
-from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.dynamics.tally import TABLE, Tally
 from jaxgran.maps.replica import Replica
 from jaxgran.maps.settings import MapSettings

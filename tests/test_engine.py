@@ -13,10 +13,10 @@ from flows import GRAINS, assert_same_bits
 from synthetic import refused
 
 import jaxgran as jg
-from jaxgran.cache import persistent_jit
 from jaxgran.contact.projected_methods import solver_name
-from jaxgran.dynamics import advance
-from jaxgran.dynamics.engine import Numerics, _warn_once, in_lockstep, select_engine
+from jaxgran.dynamics.batching import in_lockstep
+from jaxgran.dynamics.engine import Numerics, _warn_once, select_engine
+from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.settings import MapSettings
@@ -30,8 +30,8 @@ def of(**others) -> jg.ShearFlow:
     return jg.ShearFlow(GRAINS, 0.5, 0.7, 1e-3, **others)
 
 
-def selected(state=None, option="", **numerics) -> str:
-    return select_engine(of(), Numerics(**numerics), state, option).name
+def selected(state=None, **numerics) -> str:
+    return select_engine(Numerics(**numerics), state).name
 
 
 def single(state: jg.State) -> jg.State:
@@ -57,7 +57,6 @@ def test_auto_takes_the_machine_code_where_it_can_and_jax_elsewhere(flowing) -> 
     )
     assert selected(state, solver=jg.Nesterov()) == "jax"
     assert selected(single(state)) == "jax"
-    assert selected(state, "events") == "jax"
 
 
 def test_a_state_of_several_precisions_is_one_sentence(flowing) -> None:
@@ -86,25 +85,7 @@ IMPOSSIBLE = {
     ),
     "single precision": (
         lambda state: jg.advance(of(), single(state), STEPS, engine=jg.Numba()),
-        (
-            "in float32, not numba: it runs on the device cpu, in float64, with the solver "
-            "barzilai-borwein"
-        ),
-    ),
-    "moving contacts": (
-        lambda state: jg.advance(of(), state, STEPS, moving_contacts=True, engine=jg.Numba()),
-        "with moving_contacts, not numba",
-    ),
-    "derivatives in reverse mode": (
-        lambda state: jax.grad(
-            lambda alpha: jnp.sum(
-                jg.advance(
-                    replace(of(), restitution=alpha), state, STEPS, events=50, engine=jg.Numba()
-                )[0].velocities
-                ** 2
-            )
-        )(0.5),
-        "with events, not numba: it runs on the device cpu",
+        'in float32 (jax.config.update("jax_enable_x64", True) computes in float64), not numba',
     ),
 }
 
@@ -133,17 +114,19 @@ def test_a_number_of_steps_may_be_one_of_python(engine, flowing) -> None:
     assert_same_bits(*(jg.advance(of(), state, steps, engine=engine) for steps in (100, STEPS)))
 
 
-def test_jax_by_name_is_the_plain_advance(flowing, monkeypatch) -> None:
-    monkeypatch.setattr(advance, "advance_by_jax", lambda *arguments, **_: arguments)
-    monkeypatch.setattr(advance, "in_batch", lambda: True)  # so that nothing is traced
-    for numerics in (
-        {"engine": jg.Jax()},
-        {"solver": jg.Jacobi()},
-        {"engine": jg.Jax(), "solver": jg.Jacobi()},
-    ):
-        solver = numerics.get("solver", jg.BarzilaiBorwein())
-        arguments = jg.advance(of(), flowing(0.7), STEPS, **numerics)
-        assert arguments == (of(), solver, flowing(0.7), STEPS, True, None, False)
+@pytest.mark.parametrize("numerics", [{"engine": jg.Jax()}, {"solver": jg.Jacobi()}])
+def test_jax_by_name_and_for_another_solver_is_the_plain_advance(numerics, flowing) -> None:
+    solver = numerics.get("solver", jg.BarzilaiBorwein())
+    chosen = jax.jit(partial(jg.advance, **numerics))(of(), flowing(0.7), STEPS)
+    assert_same_bits(chosen, jax.jit(advance_by_jax)(of(), solver, flowing(0.7), STEPS))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("events", 0), ("free_flight", 1), ("moving_contacts", "no")]
+)
+def test_options_of_the_engine_jax_are_checked(name: str, value) -> None:
+    with refused(f"{name} must be"):
+        jg.Jax(**{name: value})
 
 
 # What stands in a dataset
@@ -177,7 +160,7 @@ def test_a_dataset_names_what_ran_and_what_was_asked_for(
 def test_in_single_precision_a_map_is_of_the_engine_jax() -> None:
     with jax.enable_x64(False):
         data = map_dataset(SETTINGS, {}, {})
-        assert "in float32, not numba" in refusal(
+        assert "in float32 (jax.config.update" in refusal(
             lambda: require_engine(replace(SETTINGS, engine=jg.Numba()))
         )
     assert (data.attrs["precision"], data.attrs["engine"], data.attrs["solver"]) == (
@@ -193,7 +176,6 @@ def test_the_default_device_chooses_the_engine_not_the_backend(flowing, monkeypa
     flows, states = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), (of(), flowing(0.7)))
     with jax.default_device(jax.devices("cpu")[0]):
         assert not in_lockstep()
-        assert persistent_jit._folder() is not None  # programs for the processor are kept on disk
         _, tally = jg.advance(flows, states, STEPS, engine=jg.Numba())
     assert np.all(np.asarray(tally.steps) == int(STEPS))
 

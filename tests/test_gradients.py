@@ -20,7 +20,8 @@ from jaxgran.contact.near_pairs import Frame, present, separations_now
 from jaxgran.contact.network import Contacts, pair_motion
 from jaxgran.contact.projected_methods import BarzilaiBorwein, Nesterov
 from jaxgran.contact.solver import solve
-from jaxgran.dynamics.jax_engine import advance_by_jax, count_events
+from jaxgran.dynamics.advance import count_events
+from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.dynamics.moving_contacts import displaced
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
@@ -173,8 +174,8 @@ def parameters(flow: ShearFlow, state: State) -> dict:
     return numbers | own | {"positions": state.positions, "velocities": state.velocities}
 
 
-def exact_advance(flow, *arguments):
-    return advance_by_jax(flow, EXACT, *arguments)
+def exact_advance(flow, *arguments, **options):
+    return advance_by_jax(flow, EXACT, *arguments, **options)
 
 
 def changed(flow: ShearFlow, state: State, values: dict) -> tuple[ShearFlow, State]:
@@ -229,7 +230,7 @@ def backward(tilting, score_of, events_of):
     @jax.jit
     def compiled(values: dict, steps):
         def score(values: dict):
-            after, tally = exact_advance(*changed(*tilting, values), steps, True, events)
+            after, tally = exact_advance(*changed(*tilting, values), steps, events=events)
             return score_of(after), tally
 
         return jax.value_and_grad(score, has_aux=True)(values)
@@ -305,7 +306,8 @@ def collision(gap, scene, dt: float, moving_contacts: bool):
     state = scene([[3.0, 0.0], [4.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]])
     flow = ShearFlow(GRAINS, 0.5, GRAINS * np.pi / 4 / 40**2, dt)
     state = replace(state, positions=state.positions.at[1, 0].add(gap))
-    end, _ = exact_advance(flow, state, jnp.int32(round(0.5 / dt)), True, None, moving_contacts)
+    steps = jnp.int32(round(0.5 / dt))
+    end, _ = exact_advance(flow, state, steps, moving_contacts=moving_contacts)
     return end.positions[0, 0]
 
 

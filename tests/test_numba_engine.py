@@ -15,8 +15,8 @@ import pytest
 from flows import GRAINS
 
 import jaxgran
-from jaxgran.dynamics.advance import advance, advance_blocks
-from jaxgran.dynamics.engine import Numba, Numerics
+from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.engine import Numba
 from jaxgran.dynamics.numba_engine import ffi, handler
 from jaxgran.dynamics.tally import TABLE
 from jaxgran.files import read_cached, write_cached
@@ -143,7 +143,7 @@ def test_blocks_of_one_call_are_those_of_one_call_each(flowing, packing_fraction
     """
     flow, state = ShearFlow(GRAINS, 0.6, packing_fraction, 1e-3), flowing(packing_fraction)
     steps = jnp.asarray([20, 0, 1, 7, 30, 12])
-    end, tallies = advance_blocks(flow, Numerics(engine=Numba()), state, steps)
+    end, tallies = advance(flow, state, steps, engine=Numba())
     for k, count in enumerate(steps):
         state, tally = advance(flow, state, count, engine=Numba())
         for name in TABLE:

@@ -12,12 +12,11 @@ import pytest
 from flows import GRAINS
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
-from jaxgran.dynamics import observed_advance
 from jaxgran.dynamics.advance import advance
-from jaxgran.dynamics.engine import Jax, Numba, Numerics
-from jaxgran.dynamics.observed_advance import advance_observed
+from jaxgran.dynamics.engine import Jax, Numba
+from jaxgran.dynamics.numba_engine import observed as records
 from jaxgran.dynamics.observer import Observed, middle_of_flight
-from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
+from jaxgran.dynamics.snapshot import Snapshot, snapshot_of
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.sample import BLOCKS
@@ -120,10 +119,10 @@ def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monke
     """With room for three, the numba engine is suspended after every other step with contacts, and
     takes none twice.
     """
-    monkeypatch.setattr(observed_advance, "_MOST_ROOM", 3)
+    monkeypatch.setattr(records, "_MOST_ROOM", 3)
     steps = jnp.int32(320)
-    observing = jax.jit(lambda state: advance_observed(FLOW, Numerics(), state, steps, all_of_step))
-    state, tally, own = observing(flowing(0.7))
+    state, tally = jax.jit(lambda state: advance(FLOW, state, steps, observe))(flowing(0.7))
+    own, tally = tally.observed, replace(tally, observed=None)
     plain = jax.jit(lambda state: advance(FLOW, state, steps))(flowing(0.7))
     jax.tree.map(np.testing.assert_array_equal, (state, tally), plain)
     assert tally.solves == jnp.sum(observed[1].tally.solves) > 50
@@ -137,10 +136,9 @@ def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monke
 
 
 def test_engine_jax_observes_the_same(flowing, run) -> None:
-    numerics, state, steps = Numerics(engine=Jax()), flowing(0.7), jnp.int32(200)
-    end, tally, own = jax.jit(
-        lambda state: advance_observed(FLOW, numerics, state, steps, all_of_step)
-    )(state)
+    state, steps = flowing(0.7), jnp.int32(200)
+    end, tally = jax.jit(lambda state: advance(FLOW, state, steps, observe, engine=Jax()))(state)
+    own = tally.observed
     plain_end, plain_tally = run(FLOW, state, 200, solver=BarzilaiBorwein())
     np.testing.assert_allclose(end.velocities, plain_end.velocities, atol=1e-9)
     assert tally.solves == plain_tally.solves > 20
@@ -148,9 +146,7 @@ def test_engine_jax_observes_the_same(flowing, run) -> None:
     np.testing.assert_allclose(
         own["stress"] * FLOW.timestep * state.side**2, tally.contact_moment, rtol=1e-12
     )
-    _, _, recorded = jax.jit(
-        lambda state: advance_observed(FLOW, Numerics(), state, steps, all_of_step)
-    )(state)
+    recorded = jax.jit(lambda state: advance(FLOW, state, steps, observe))(state)[1].observed
     assert own.keys() == recorded.keys()
     for name in own:
         np.testing.assert_allclose(own[name], recorded[name], rtol=1e-3, atol=1e-3, err_msg=name)
@@ -193,7 +189,7 @@ def test_callback_is_refused_under_a_transformation(flowing) -> None:
 
 
 def test_the_fewest_records_of_a_call_give_the_same_sums(flowing, observed, monkeypatch) -> None:
-    monkeypatch.setattr(observed_advance, "_MOST_BYTES", 1)
+    monkeypatch.setattr(records, "_MOST_BYTES", 1)
     _, own = sample(FLOW, flowing(0.7), STRAIN, observe=lambda seen: observe(seen))
     same = partial(np.testing.assert_allclose, rtol=1e-14)  # XLA may add up in another order
     jax.tree.map(same, own.observed_sums, observed[1].observed_sums)

@@ -6,7 +6,6 @@ import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -18,10 +17,6 @@ from synthetic import refused
 from test_docs import python_of
 
 import jaxgran as jg
-from jaxgran.dynamics import engine
-from jaxgran.dynamics.batch import over_replicas
-from jaxgran.dynamics.engine import Numerics
-from jaxgran.model.control_flow import in_batch
 from jaxgran.model.state import State
 from jaxgran.sampling import sampler
 
@@ -90,18 +85,6 @@ def test_strains_and_steps_may_differ_between_replicas(states: State) -> None:
 def test_snapshots_take_a_batch(states: State) -> None:
     series = partial(jg.snapshot_series, strain=0.02, count=2)
     assert_same(series(FLOWS, states), jax.vmap(series)(FLOWS, states))
-
-
-@pytest.mark.parametrize("numerics", [{}, {"engine": jg.Jax()}, {"solver": jg.Jacobi()}])
-@pytest.mark.parametrize("platform", ["cpu", "accelerator"])
-def test_replicas_advance_together_on_an_accelerator_only(
-    states: State, numerics: Any, platform: str, monkeypatch
-):
-    monkeypatch.setattr(engine, "default_device", lambda: SimpleNamespace(platform=platform))
-    found = over_replicas(
-        lambda flow, _: flow.restitution * float(in_batch()), Numerics(**numerics), (FLOWS, states)
-    )
-    np.testing.assert_array_equal(found, ALPHAS * float(platform == "accelerator"))
 
 
 def test_batches_of_any_size_are_compiled_once(states: State) -> None:

@@ -13,7 +13,8 @@ from oracles import nearest_image
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from jaxgran.dynamics.snapshots import collided, flown, snapshot, snapshot_series
+from jaxgran.dynamics.snapshot import collided, flown
+from jaxgran.dynamics.snapshots import snapshot, snapshot_series
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status

@@ -15,7 +15,8 @@ from jaxgran.analysis.contacts import (
 )
 from jaxgran.analysis.series import series
 from jaxgran.contact.projected_methods import BarzilaiBorwein
-from jaxgran.dynamics.snapshots import Snapshot, snapshot_series
+from jaxgran.dynamics.snapshot import Snapshot
+from jaxgran.dynamics.snapshots import snapshot_series
 from jaxgran.model.flow import ShearFlow
 
 

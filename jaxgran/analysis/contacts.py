@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxgran.analysis.series import Measured, by_time, ratio, series, with_errors
 from jaxgran.contact.clusters import cluster_labels
-from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.model.cell import centred
 
 

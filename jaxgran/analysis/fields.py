@@ -29,7 +29,7 @@ from jax import lax
 from jax.scipy.special import erf
 from jaxtyping import Array, Float, Int
 
-from jaxgran.dynamics.snapshots import Snapshot, collided
+from jaxgran.dynamics.snapshot import Snapshot, collided
 from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import displacement
 from jaxgran.model.checks import (

@@ -20,9 +20,9 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
-from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.advance import advance, count_events, require_advance
 from jaxgran.dynamics.batch import checked_batch
-from jaxgran.dynamics.jax_engine import count_events, require_advance
+from jaxgran.dynamics.engine import Jax
 from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import displacement
 from jaxgran.model.checks import InputError, require_number, require_untraced, require_whole
@@ -166,7 +166,8 @@ def _residuals(
     """Deviations of a window at its end in standard deviations, positions first; and its status."""
     (flow, state, steps), end = window
     later, start = replace(flow, restitution=restitution), _moved(state, noises, offsets)
-    after, tally = advance(later, start, steps, events=events, moving_contacts=True, solver=_SOLVER)
+    engine = Jax(events=events, moving_contacts=True)
+    after, tally = advance(later, start, steps, solver=_SOLVER, engine=engine)
     apart = displacement(after.positions, end.positions, after.side, after.tilt)
     faster = after.velocities - end.velocities
     residuals = [apart / noises["positions"], faster / noises["velocities"]]

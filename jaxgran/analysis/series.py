@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.statistics import jackknife
 
 Sums = Mapping[str, Any]  # NumPy arrays or scalars by name

@@ -74,12 +74,10 @@ def _devices() -> dict[str, str]:
         names = environment.devices()
     except RuntimeError as failure:  # the report is needed most if there is none
         return {"devices": f"none: {failure}", "engine": "none", "solver": "none"}
-    from jaxgran.dynamics.engine import DEFAULT_NUMERICS, select_engine, solver_in_use
-    from jaxgran.model.flow import ShearFlow
+    from jaxgran.dynamics.engine import DEFAULT_NUMERICS, select_engine
 
-    flow = ShearFlow(grains=256, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
-    engine = select_engine(flow, DEFAULT_NUMERICS)
-    solver = solver_in_use(engine, DEFAULT_NUMERICS.solver)
+    engine = select_engine(DEFAULT_NUMERICS)
+    solver = engine.solver_in_use(DEFAULT_NUMERICS.solver)
     return {"devices": ", ".join(names), "engine": f"auto takes {engine.name}", "solver": solver}
 
 

@@ -1,4 +1,4 @@
-"""Batches of replicas: their checks, and who advances them on which cores and devices.
+"""Batches of replicas: their checks, and who advances them on which cores.
 
 All arrays of a batch have a leading (replicas,) axis. The results of a replica do not depend on its
 batch, to the bit.
@@ -9,9 +9,6 @@ where                       how the replicas of a batch advance
 a processor                 ``sample`` and ``prepare`` call the compiled function of one replica for
                             each, in threads on several cores (``run_batch``)
 an accelerator              in lockstep, in one compiled function of the batch
-several devices             each device advances its share; devices of all hosts that
-                            ``jax.distributed`` connects wait for each other at the end of a call
-                            only, and all hosts get all results
 within ``jit``, ``vmap``, … by ``vmap``, or in turn (``over_replicas``)
 ==========================  ========================================================================
 """
@@ -27,14 +24,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Float
 
-from jaxgran.dynamics.engine import Jax, Numerics, in_lockstep, select_engine
+from jaxgran.dynamics.batching import in_lockstep
+from jaxgran.dynamics.engine import Numba, Numerics, select_engine
 from jaxgran.dynamics.interruption import PATIENCE, engines_stopped, waited
 from jaxgran.environment import usable_threads
 from jaxgran.model.checks import InputError, is_traced
-from jaxgran.model.control_flow import AXIS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
@@ -42,7 +38,6 @@ Arguments = tuple[Any, ...]  # a flow, a state and numbers
 Send = Callable[[Any], None]
 T = TypeVar("T")
 _DIMENSIONS = (1, 1, 2, 2, 0, 0)  # of the arrays of one state, in the order of its leaves
-_DEVICES = "devices"
 
 
 def stack(flows: Sequence[ShearFlow]) -> ShearFlow:
@@ -121,34 +116,17 @@ def replicas_of(batch: Any) -> Iterator[Any]:
         yield jax.tree.map(lambda x, k=k: x[k], arrays)
 
 
-def over_replicas(
-    function: Callable, numerics: Numerics, batch: Arguments, option: str = ""
-) -> Any:
-    """The function of one replica for a batch, with the engine that ``select_engine`` takes for it.
-
-    On a processor ``Numba`` advances the replicas by ``vmap``, and ``Jax`` in turn by ``lax.map``.
-    On an accelerator they advance in lockstep, by ``vmap`` with a named axis.
+def over_replicas(function: Callable[..., T], numerics: Numerics, batch: Arguments) -> T:
+    """The function of one replica for a batch that JAX may trace: by ``vmap``, which advances the
+    replicas as they do best, or in turn where the engine ``Jax`` takes a processor.
     """
-    flow, state, *_ = batch
-    lockstep = in_lockstep()
-    if lockstep or isinstance(select_engine(flow, numerics, state, option), Jax):
-        return _by_jax(function, lockstep, batch)
-    return jax.vmap(function)(*batch)
-
-
-def _by_jax(function: Callable[..., Any], lockstep: bool, batch: Arguments) -> Any:
-    """The function of one replica for a batch, in lockstep or in turn."""
-    if lockstep:
-        return jax.vmap(function, axis_name=AXIS)(*batch)
+    if isinstance(select_engine(numerics, batch[1]), Numba) or in_lockstep():
+        return jax.vmap(function)(*batch)
     return lax.map(lambda replica: function(*replica), batch)
 
 
 def shear_batch(
-    function: Callable[..., Any],
-    numerics: Numerics,
-    batch: Arguments,
-    static: tuple = (),
-    option: str = "",
+    function: Callable[..., Any], numerics: Numerics, batch: Arguments, static: tuple = ()
 ) -> Any:
     """The results of ``function(flow, state, strain, numerics, *static)``, compiled, for all
     replicas of a batch; JAX may trace it.
@@ -158,7 +136,7 @@ def shear_batch(
         def of_replica(*replica: Any) -> Any:
             return function(*replica, numerics, *static)
 
-        return over_replicas(of_replica, numerics, batch, option)
+        return over_replicas(of_replica, numerics, batch)
     flow, _, strain = batch
     costs = predicted_cost(flow) * np.asarray(strain)
     results = run_batch(function, batch, (numerics,), static, costs, usable_threads())
@@ -173,18 +151,18 @@ def run_batch(
     costs: Float[np.ndarray, " replicas"] | None = None,
     threads: int = 1,
 ) -> Any:
-    """The results of a function of one replica for all replicas of a batch, on all devices.
+    """The results of a function of one replica for all replicas of a batch.
 
     Args:
-      function: called as ``function(*replica, *shared, *static)``; compiled for one replica. So
-        batches of any size need no further compilation where JAX has one processor.
+      function: called as ``function(*replica, *shared, *static)``; compiled for one replica, so
+        that batches of any size need no further compilation on a processor.
       batch: arguments with a leading (replicas,) axis.
       shared, static: arguments that all replicas have in common; the latter are not traced.
       costs: relative cost of each replica. Threads begin with the most expensive ones.
       threads: most threads on a processor.
     """
-    if in_lockstep() or jax.device_count() > 1:
-        return waited(_together(function, static, in_lockstep(), shared, batch))
+    if in_lockstep():
+        return waited(_together(function, static, shared, batch))
     replicas = list(replicas_of(batch))
 
     def run(k: int, _: Send = lambda _: None) -> Any:
@@ -199,38 +177,10 @@ def run_batch(
     return jax.tree.map(lambda *x: np.array(x), *(results[k] for k in range(len(replicas))))
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _together(
-    function: Callable[..., Any], static: tuple, lockstep: bool, shared: tuple, batch: Arguments
-) -> Any:
-    """The replicas of a batch in lockstep or in turn, on each device an equal share of them; copies
-    of replicas fill up the last share.
-    """
-
-    def share(shared: tuple, batch: Arguments) -> Any:
-        def run(*replica: Any) -> Any:
-            return function(*replica, *shared, *static)
-
-        return _by_jax(run, lockstep, batch)
-
-    def gathered(shared: tuple, batch: Arguments) -> Any:
-        results = share(shared, batch)
-        return jax.tree.map(lambda x: lax.all_gather(x, _DEVICES, tiled=True), results)
-
-    devices, count = jax.devices(), len(jax.tree.leaves(batch)[0])
-    if len(devices) == 1 or count == 1:
-        return share(shared, batch)
-    size = -(-count // len(devices))  # rounded up
-    filled = jax.tree.map(lambda x: x[np.arange(size * len(devices)) % count], batch)
-    everywhere, shares = PartitionSpec(), PartitionSpec(_DEVICES)
-    on_devices = jax.shard_map(
-        gathered,
-        mesh=Mesh(np.asarray(devices), (_DEVICES,)),
-        in_specs=(everywhere, shares),
-        out_specs=everywhere,
-        check_vma=False,
-    )
-    return jax.tree.map(lambda x: x[:count], on_devices(shared, filled))
+@partial(jax.jit, static_argnums=(0, 1))
+def _together(function: Callable[..., T], static: tuple, shared: tuple, batch: Arguments) -> T:
+    """The replicas of a batch in lockstep."""
+    return jax.vmap(lambda *replica: function(*replica, *shared, *static))(*batch)
 
 
 def predicted_cost(flow: ShearFlow, timestep: Any = None) -> Any:

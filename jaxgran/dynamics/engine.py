@@ -1,34 +1,40 @@
-"""The engines that advance a flow, and the choice of one for the device, precision, solver and
-options.
+"""The engines that advance a flow, and the choice of one for the device, the precision and the
+solver.
 
-Both engines solve the same steps to the same tolerance, and differ in speed and rounding.
-``LIMITS`` is the table of what each can do. Where no engine is given, ``Numba`` is taken if it can
-do what is asked for, and otherwise ``Jax``. A given engine that cannot raises an InputError.
+Both engines solve the same steps to the same tolerance, and differ in speed and rounding. An engine
+is an object with two methods: ``refuses`` says what it cannot do, and ``advance`` advances one
+replica. Where none is given, ``Numba`` is taken if it can do what is asked for, and otherwise
+``Jax``.
 """
 
 import warnings
 from dataclasses import dataclass, field
-from functools import cache
-from typing import Any, ClassVar, NamedTuple
+from functools import cache, partial
+from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Int
 
 from jaxgran.contact.projected_methods import (
     DEFAULT_SOLVER,
+    BarzilaiBorwein,
     ProjectedMethod,
     require_solver,
     solver_name,
 )
+from jaxgran.dynamics.batching import with_forward_derivative, with_own_batching
+from jaxgran.dynamics.jax_engine import advance_by_jax
+from jaxgran.dynamics.observer import Observe
+from jaxgran.dynamics.tally import Tally
 from jaxgran.environment import default_device, precision
-from jaxgran.model.checks import InputError, short_repr
+from jaxgran.model.checks import InputError, require_flag, require_whole, short_repr
+from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
-_SINGLE_PRECISION = (
-    "JAX computes in single precision, in which flows take the engine jax, several times slower "
-    "than the numba engine: "
-    'begin with jax.config.update("jax_enable_x64", True).'
-)
+_ENABLE_X64 = 'jax.config.update("jax_enable_x64", True)'
 
 
 @dataclass(frozen=True)
@@ -36,13 +42,66 @@ class Jax:
     """The engine in JAX: every backend, precision and solver, and derivatives.
 
     The replicas of a batch advance one by one on a processor, in lockstep on an accelerator.
+    Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) need no argument. Reverse-mode
+    derivatives (``jax.grad``, ``jax.vjp``) need the number of ``events``. Reverse mode stores the
+    state and the lists of every event, about 0.6 kB a grain, and computes contacts and impulses
+    again in the backward pass.
+
+    Args:
+      events: number of visited steps of an advance, or of each of its blocks, for a loop of fixed
+        length; ``2 * steps + 1`` is always enough, and ``count_events`` counts them. If they are
+        too few, the status is ``capacity``, and numbers and derivatives are NaN. None visits as
+        many as needed.
+      moving_contacts: whether derivatives include the shift of the contacts in time, see
+        ``dynamics.jax_engine``. Values do not change.
+      free_flight: True jumps over steps without an approaching contact; False visits every step.
+        The trajectory is the same.
 
     Examples:
-      >>> Jax()
-      Jax()
+      >>> Jax(events=400)
+      Jax(events=400, moving_contacts=False, free_flight=True)
     """
 
+    events: int | None = None
+    moving_contacts: bool = False
+    free_flight: bool = True
     name: ClassVar[str] = "jax"
+
+    def __post_init__(self) -> None:
+        if self.events is not None:
+            require_whole("events", self.events, 1, MAX_STEPS, "the most steps of an advance")
+        require_flag("moving_contacts", self.moving_contacts)
+        require_flag("free_flight", self.free_flight)
+
+    def refuses(self, dtype: str, solver: ProjectedMethod) -> str:
+        """What this engine cannot do; "" as it can do all."""
+        return ""
+
+    def solver_in_use(self, solver: ProjectedMethod) -> str:
+        """Name of the method that solves contacts; isolated pairs have a closed form."""
+        return solver_name(solver)
+
+    def advance(
+        self,
+        flow: ShearFlow,
+        solver: ProjectedMethod,
+        state: State,
+        steps: Int[Array, "*blocks"],
+        observe: Observe | None = None,
+    ) -> tuple[State, Tally]:
+        """Advance one replica by a number of steps, or by one block of steps after another with a
+        tally (blocks,) for each.
+        """
+        run = partial(
+            advance_by_jax,
+            observe=observe,
+            events=self.events,
+            moving_contacts=self.moving_contacts,
+            free_flight=self.free_flight,
+        )
+        if self.events is None:
+            run = with_forward_derivative(with_own_batching(run), run)
+        return run(flow, solver, state, steps)
 
 
 @dataclass(frozen=True)
@@ -53,7 +112,8 @@ class Numba:
     It solves clusters one by one, by Gauss–Seidel sweeps and then by the method of the solver, to
     its ``tolerance`` and within its ``max_steps``. Under ``jax.vmap`` replicas advance on all
     cores, with the same bits on any number of threads; the environment variable
-    ``NUMBA_NUM_THREADS`` sets their number. ``jax.lax.map`` takes one at a time.
+    ``NUMBA_NUM_THREADS`` sets their number. ``jax.lax.map`` takes one at a time. Derivatives in
+    forward mode, and the values beside them, are those of ``Jax``.
 
     Examples:
       >>> Numba()
@@ -61,27 +121,57 @@ class Numba:
     """
 
     name: ClassVar[str] = "numba"
-    solver: ClassVar[str] = "gauss-seidel, barzilai-borwein where stiff"
+
+    def refuses(self, dtype: str, solver: ProjectedMethod) -> str:
+        """What this engine cannot do of what is asked for, in words; "" if it can do all."""
+        platform = default_device().platform
+        wrong = {
+            f"on the device {platform}": platform != "cpu",
+            f"in {dtype} ({_ENABLE_X64} computes in float64)": dtype != "float64",
+            f"with the solver {solver_name(solver)}": type(solver) is not BarzilaiBorwein,
+        }
+        return " and ".join(words for words, holds in wrong.items() if holds)
+
+    def solver_in_use(self, solver: ProjectedMethod) -> str:
+        """Name of the method that solves contacts; isolated pairs have a closed form."""
+        return f"gauss-seidel, {solver_name(solver)} where stiff"
+
+    def advance(
+        self,
+        flow: ShearFlow,
+        solver: ProjectedMethod,
+        state: State,
+        steps: Int[Array, "*blocks"],
+        observe: Observe | None = None,
+    ) -> tuple[State, Tally]:
+        """As ``Jax.advance``; the list of near pairs outlives a block, where nothing is
+        observed.
+        """
+        run = partial(_advance_by_numba, observe=observe)
+        differentiable = partial(advance_by_jax, observe=observe)
+        return with_forward_derivative(run, differentiable)(flow, solver, state, steps)
+
+
+def _advance_by_numba(
+    flow: ShearFlow,
+    solver: ProjectedMethod,
+    state: State,
+    steps: Int[Array, "*blocks"],
+    observe: Observe | None,
+) -> tuple[State, Tally]:
+    from jaxgran.dynamics.numba_engine.call import advance_by_numba
+    from jaxgran.dynamics.numba_engine.observed import observe_by_numba
+
+    if observe is None:
+        return advance_by_numba(flow, solver, state, steps)
+
+    def of_block(state: State, steps: Array) -> tuple[State, Tally]:
+        return observe_by_numba(observe, flow, solver, state, steps)
+
+    return lax.scan(of_block, state, steps) if jnp.ndim(steps) else of_block(state, steps)
 
 
 Engine = Jax | Numba
-
-
-class Needs(NamedTuple):
-    """What a flow needs of an engine; in ``LIMITS`` what an engine accepts, None for everything."""
-
-    device: Any
-    precision: Any
-    solver: Any
-    option: Any
-
-
-_WORDS = Needs("on the device {}", "in {}", "with the solver {}", "with {}")
-LIMITS: dict[type, Needs] = {
-    #            device    precision     solver                 option
-    Numba: Needs(("cpu",), ("float64",), ("barzilai-borwein",), ("", "observe")),
-    Jax: Needs(None, None, None, None),
-}
 
 
 def engine_named(name: str) -> Engine | None:
@@ -94,10 +184,7 @@ def engine_named(name: str) -> Engine | None:
       >>> engine_named("numba"), engine_named("auto")
       (Numba(), None)
     """
-    engines: dict[str, Engine | None] = {
-        "auto": None,
-        **{kind.name: kind() for kind in (Jax, Numba)},
-    }
+    engines: dict[str, Engine | None] = {"auto": None, Jax.name: Jax(), Numba.name: Numba()}
     if str(name) not in engines:
         raise InputError(f"engine must be {', '.join(engines)}, not {short_repr(name)}.")
     return engines[str(name)]
@@ -127,69 +214,39 @@ def checked_numerics(solver: Any, engine: Any) -> Numerics:
     return Numerics(solver, engine)
 
 
-def select_engine(
-    flow: ShearFlow, numerics: Numerics, state: State | None = None, option: str = ""
-) -> Engine:
-    """The engine that was asked for, or else the first of ``LIMITS`` that can advance a flow.
+def select_engine(numerics: Numerics, state: State | None = None) -> Engine:
+    """The engine that was asked for, or ``Numba`` if it can advance a state, or else ``Jax``.
 
     Args:
-      flow: gives the number of grains; it may be a batch.
       numerics: the solver, and the engine that was asked for.
       state: gives the precision; None for JAX's default precision.
-      option: name of an option that not all engines have; "" if there is none.
 
     Raises:
       InputError: the engine that was asked for cannot do this, or JAX computes in single precision
         and the state is in double precision.
     """
-    engine = numerics.engine or Numba()
     dtype = precision() if state is None else str(state.positions.dtype)
     if dtype == "float64" != precision():
         raise InputError(
             "state must be of the precision in which JAX computes, float32, not float64: begin "
-            'with jax.config.update("jax_enable_x64", True).'
+            f"with {_ENABLE_X64}."
         )
-    needs = Needs(default_device().platform, dtype, solver_name(numerics.solver), option)
-    limits = LIMITS[type(engine)]
-    unmet = {
-        name: words.format(value)
-        for name, words, value, accepted in zip(Needs._fields, _WORDS, needs, limits, strict=True)
-        if accepted is not None and value not in accepted
-    }
-    if not unmet:
+    engine = numerics.engine or Numba()
+    wrong = engine.refuses(dtype, numerics.solver)
+    if not wrong:
         return engine
-    if numerics.engine is None:
-        if state is not None and [*unmet] == ["precision"] and precision() == "float32":
-            _warn_once(_SINGLE_PRECISION)
-        return Jax()
-    wrong = " and ".join(unmet.values())
-    accepted = [" or ".join(value or "no option" for value in values) for values in limits]
-    runs = ", ".join(words.format(values) for words, values in zip(_WORDS, accepted, strict=True))
-    hint = ' (jax.config.update("jax_enable_x64", True))' if "precision" in unmet else ""
-    raise InputError(
-        f"engine must be jax or chosen automatically {wrong}, not {engine.name}: it runs {runs} "
-        f"only{hint}."
-    )
-
-
-def in_lockstep() -> bool:
-    """Whether the replicas of a batch advance together, as one array program that waits for its
-    slowest replica.
-
-    They do on an accelerator. On a processor each advances by itself, which is faster.
-    """
-    return default_device().platform != "cpu"
-
-
-def solver_in_use(engine: Engine, solver: ProjectedMethod) -> str:
-    """Name of the method that solves the contacts in an engine; isolated pairs have a closed form
-    in both.
-
-    Examples:
-      >>> solver_in_use(Jax(), DEFAULT_SOLVER), solver_in_use(Numba(), DEFAULT_SOLVER)
-      ('barzilai-borwein', 'gauss-seidel, barzilai-borwein where stiff')
-    """
-    return solver_name(solver) if isinstance(engine, Jax) else engine.solver
+    if numerics.engine is not None:
+        raise InputError(f"engine must be jax or chosen automatically {wrong}, not {engine.name}.")
+    if (
+        state is not None
+        and precision() == "float32"
+        and not engine.refuses("float64", numerics.solver)
+    ):
+        _warn_once(
+            "JAX computes in single precision, in which flows take the engine jax, several times "
+            f"slower than the numba engine: begin with {_ENABLE_X64}."
+        )
+    return Jax()
 
 
 @cache

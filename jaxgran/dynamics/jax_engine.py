@@ -15,8 +15,9 @@ does, to first order, with the values as they are. This is exact for collisions 
 a grain strikes a cluster, only the impulse that its own approach accounts for moves in time.
 """
 
+from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -24,11 +25,11 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from jaxgran.contact.near_pairs import present
-from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
+from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.observer import Observe
 from jaxgran.dynamics.step import (
-    Advance,
     Carry,
+    Constants,
     event,
     needs_lists,
     refresh_lists,
@@ -37,29 +38,17 @@ from jaxgran.dynamics.step import (
 )
 from jaxgran.dynamics.tally import RunningSums, Tally
 from jaxgran.dynamics.velocity_scales import readings
-from jaxgran.model.checks import require_number, require_whole
-from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.control_flow import any_replica
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import (
     State,
     kinetic_energy,
     relative_momentum,
-    require_state,
     status_if_finite,
 )
 from jaxgran.model.status import Status
 
 T = TypeVar("T")
-
-
-def require_advance(flow: ShearFlow, state: State, steps: Any) -> None:
-    """Raise an InputError unless this is one flow, one state of it and a number of time steps."""
-    require_state(flow, state)
-    words = f"a whole number of 0 to {MAX_STEPS}"
-    require_number(
-        "steps", steps, lambda x: (x.dtype.kind in "iu") & (x >= 0) & (x <= MAX_STEPS), words
-    )
 
 
 def contact_buffers(grains: int) -> tuple[int, ...]:
@@ -71,88 +60,82 @@ def advance_by_jax(
     flow: ShearFlow,
     solver: ProjectedMethod,
     state: State,
-    steps: Int[Array, ""],
-    free_flight: bool | Array = True,
+    steps: Int[Array, "*blocks"],
+    observe: Observe | None = None,
+    *,
     events: int | None = None,
     moving_contacts: bool = False,
+    free_flight: bool = True,
 ) -> tuple[State, Tally]:
-    """Advance one replica by the engine ``Jax``.
+    """Advance one replica by a number of steps, or by one block of steps after another with a tally
+    (blocks,) for each.
 
-    Arguments, derivatives and results are those of ``dynamics.advance``.
+    The options are those of the engine ``Jax``.
     """
     # For derivatives, one size of a solve is compiled.
     derivatives = events is not None or moving_contacts
-    advance = _advance_of(flow, solver, state, steps)._replace(
-        free_flight=free_flight,
-        buffers=() if derivatives else contact_buffers(flow.grains),
-        moving_contacts=moving_contacts,
-    )
-    begin = start(advance, state)
-    if events is None:
-        return _ended(advance, state, _last(advance, begin))
-    require_whole("events", events, 1, MAX_STEPS, "the most steps of an advance")
-    end = _after_events(advance, begin, events)
-    return _nan_where(unfinished(advance, end), _ended(advance, state, end))
+
+    def advance(state: State, steps: Array) -> tuple[State, Tally]:
+        constants = _constants(flow, solver, state, steps)._replace(
+            free_flight=free_flight,
+            buffers=() if derivatives else contact_buffers(flow.grains),
+            moving_contacts=moving_contacts,
+            observe=observe,
+        )
+        begin = start(constants, state)
+        if events is None:
+            return _ended(constants, state, _last(constants, begin))
+        end = _after_events(constants, begin, events)
+        return _nan_where(unfinished(constants, end), _ended(constants, state, end))
+
+    return lax.scan(advance, state, steps) if jnp.ndim(steps) else advance(state, steps)
 
 
-def observe_by_jax(
-    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Int[Array, ""], observe: Observe
-) -> tuple[State, Tally, Any]:
-    """``advance_by_jax``, and the sum over all its time steps of what a function finds in them, see
-    ``observer``.
-    """
-    advance = _advance_of(flow, solver, state, steps)._replace(
-        buffers=contact_buffers(flow.grains), observe=partial(observe, flow)
-    )
-    end = _last(advance, start(advance, state))
-    return *_ended(advance, state, end), end.sums.user_sums.sums
-
-
-def _advance_of(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> Advance:
-    """The advance of a state, with the numbers of the flow in its precision."""
+def _constants(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> Constants:
+    """The constants of an advance, with the numbers of the flow in the precision of the state."""
     numbers = jax.tree.map(lambda x: jnp.asarray(x, state.side.dtype), flow)
-    return Advance(numbers, state.grains, state.side, steps, solver)
+    return Constants(numbers, state.grains, state.side, steps, solver)
 
 
-def _until_stale(advance: Advance, now: Carry) -> Carry:
+def _until_stale(constants: Constants, now: Carry) -> Carry:
     """New lists, and the events until one replica of the batch needs the next; at least one
     event.
     """
 
     def keep_going(at: tuple[Array, Carry]) -> Array:
         is_first, now = at
-        stale = any_replica(needs_lists(advance, now))
-        return any_replica(unfinished(advance, now)) & (is_first | ~stale)
+        stale = any_replica(needs_lists(constants, now))
+        return any_replica(unfinished(constants, now)) & (is_first | ~stale)
 
-    begin = jnp.bool_(True), refresh_lists(advance, now)
+    begin = jnp.bool_(True), refresh_lists(constants, now)
     _, after = lax.while_loop(
-        keep_going, lambda at: (jnp.bool_(False), event(advance, at[1])), begin
+        keep_going, lambda at: (jnp.bool_(False), event(constants, at[1])), begin
     )
     return after
 
 
-def _last(advance: Advance, begin: Carry) -> Carry:
+def _last(constants: Constants, begin: Carry) -> Carry:
     """The end of as many events as there are: a loop over lists round one over events."""
     return lax.while_loop(
-        lambda now: any_replica(unfinished(advance, now)), partial(_until_stale, advance), begin
+        lambda now: any_replica(unfinished(constants, now)), partial(_until_stale, constants), begin
     )
 
 
-def _next(advance: Advance, now: Carry) -> Carry:
+def _next(constants: Constants, now: Carry) -> Carry:
     """The next event, with new lists where they are needed."""
-    stale = any_replica(needs_lists(advance, now))
-    listed = lax.cond(stale, partial(refresh_lists, advance), lambda now: now, now)
-    return event(advance, listed)
+    stale = any_replica(needs_lists(constants, now))
+    listed = lax.cond(stale, partial(refresh_lists, constants), lambda now: now, now)
+    return event(constants, listed)
 
 
-def _after_events(advance: Advance, begin: Carry, events: int) -> Carry:
+def _after_events(constants: Constants, begin: Carry, events: int) -> Carry:
     """The end of a loop of fixed length; reverse mode keeps what is carried and computes all else
     again.
     """
 
     def visit(now: Carry, _: None) -> tuple[Carry, None]:
-        going = any_replica(unfinished(advance, now))
-        return lax.cond(going, partial(_next, advance), lambda now: now, now), None
+        going = any_replica(unfinished(constants, now))
+        return lax.cond(going, partial(_next, constants), lambda now: now, now), None
 
     return lax.scan(jax.checkpoint(visit), begin, length=events)[0]
 
@@ -167,11 +150,13 @@ def _nan_where(invalid: Array, values: T) -> T:
     )
 
 
-def _ended(advance: Advance, state: State, end: Carry) -> tuple[State, Tally]:
+def _ended(constants: Constants, state: State, end: Carry) -> tuple[State, Tally]:
     """The state and the tally at the end of an advance from a state."""
-    short = jnp.where(unfinished(advance, end), Status.capacity, Status.ok).astype(jnp.int32)
+    short = jnp.where(unfinished(constants, end), Status.capacity, Status.ok).astype(jnp.int32)
     sums = end.sums._replace(status=jnp.maximum(end.sums.status, short))
-    return ended(state, *present(end.lists, state.side), end.velocities, sums)
+    after, tally = ended(state, *present(end.lists, state.side), end.velocities, sums)
+    observed = None if constants.observe is None else sums.user_sums.sums
+    return after, replace(tally, observed=observed)
 
 
 def ended(
@@ -191,27 +176,17 @@ def ended(
     return end, tally
 
 
-def count_events(
-    flow: ShearFlow,
-    state: State,
-    steps: Int[Array, ""],
-    free_flight: bool = True,
-    *,
-    solver: ProjectedMethod = DEFAULT_SOLVER,
+def events_by_jax(
+    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Int[Array, ""]
 ) -> Int[Array, ""]:
-    """Steps that an advance by the engine ``Jax`` visits: the ``events`` that it needs in a loop of
-    fixed length.
-
-    They are those of these numbers only: with another restitution, as in an optimisation, an
-    advance may visit more. Leave room, such as half as many again; ``2 * steps + 1`` are always
-    enough. Arguments and errors are those of ``advance``.
-    """
-    require_advance(flow, state, steps)
-    require_solver(solver)
-    advance = _advance_of(flow, solver, state, steps)._replace(free_flight=free_flight)
+    """Steps that ``advance_by_jax`` visits."""
+    constants = _constants(flow, solver, state, steps)
 
     def keep_going(at: tuple[Array, Carry]) -> Array:
-        return any_replica(unfinished(advance, at[1]))
+        return any_replica(unfinished(constants, at[1]))
 
-    begin = jnp.int32(0), start(advance, state)
-    return lax.while_loop(keep_going, lambda at: (at[0] + 1, _next(advance, at[1])), begin)[0]
+    def visit(at: tuple[Array, Carry]) -> tuple[Array, Carry]:
+        number, now = at
+        return number + unfinished(constants, now), _next(constants, now)
+
+    return lax.while_loop(keep_going, visit, (jnp.int32(0), start(constants, state)))[0]

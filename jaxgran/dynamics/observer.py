@@ -11,26 +11,28 @@ anywhere in the cell. At the beginning of their flights, just after a collision,
 cold, by 2 % in a dilute flow of 64.
 """
 
+import traceback
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxgran.contact.network import Contacts
+from jaxgran.contact.network import MOST_CONTACTS, Contacts
+from jaxgran.dynamics.snapshot import Snapshot, snapshot_of
 from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
+from jaxgran.model.status import Status
 
 _NUMBERS = (bool, int, float, np.generic, np.ndarray, jax.Array)
-Observe = Callable[
-    [ShearFlow, State, Contacts, Array], Any
-]  # of a time step: state, contacts, their impulses
-ObserveNow = Callable[
-    [Contacts, Array], Any
-]  # what is found in a step with these contacts and impulses
+_NEEDS_VALUES = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
+Observe = Callable[[Snapshot], Any]  # returns a pytree of arrays to average
+# What is found now, with the contacts of a step and their impulses
+ObserveNow = Callable[[Contacts, Array], Any]
 
 
 class Observed(NamedTuple):
@@ -40,6 +42,46 @@ class Observed(NamedTuple):
 
     sums: Any
     step_observed: Float[Array, ""]
+
+
+def observe_at(observe: Observe, flow: ShearFlow, state: State) -> ObserveNow:
+    """What a user's function finds in a state of a flow.
+
+    Raises:
+      InputError: when it is called, if the function needs the values of what JAX traces.
+    """
+
+    def observe_now(contacts: Contacts, impulses: Array) -> Any:
+        snapshot = snapshot_of(flow, state, contacts, impulses, jnp.int32(Status.ok))
+        try:
+            return observe(snapshot)
+        except _NEEDS_VALUES as error:
+            raise InputError(
+                "observe must compute with jax.numpy, since JAX traces its snapshot, and "
+                f"{_line_of(observe, error)} needs the values: jnp.sum and jnp.where take the "
+                "place of functions of NumPy, float() and if."
+            ) from None
+
+    return observe_now
+
+
+def _line_of(observe: Observe, error: Exception) -> str:
+    """The line of a user's function that raised an error; "it" where that is not known."""
+    file = getattr(getattr(observe, "__code__", None), "co_filename", "")
+    lines = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+    return f"line {lines[-1].lineno}, {short_repr(lines[-1].line)}," if lines else "it"
+
+
+def uses_traced_values(observe: Observe, flow: ShearFlow, state: State) -> bool:
+    """Whether a function uses values from outside that JAX traces."""
+
+    def observation(flow: ShearFlow, state: State) -> Any:
+        return without_contacts(observe_at(observe, flow, state), state.positions.dtype)
+
+    # First what it returns is judged: other things than numbers cannot be traced.
+    slots = MOST_CONTACTS * flow.grains
+    nothing_observed(observe_at(observe, flow, state), slots, state.positions.dtype)
+    return any(isinstance(x, Tracer) for x in jax.make_jaxpr(observation)(flow, state).consts)
 
 
 def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> Observed:

@@ -1,12 +1,7 @@
-"""Snapshots: flows at single instants, with the contact forces at that instant.
-
-A time step begins with the state of a snapshot. Its contacts change the velocities at once
-(``collided``). The grains then fly freely for dt (``flown``). A contact force is the impulse over
-dt.
-"""
+"""The snapshot of a flow now, and series of them at equal intervals of strain."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,77 +9,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from jaxgran.contact.compaction import pack_bits
-from jaxgran.contact.delassus import NetworkOperator, grain_impulses
+from jaxgran.contact.delassus import NetworkOperator
 from jaxgran.contact.near_pairs import outer_pairs
 from jaxgran.contact.network import MOST_CONTACTS, Contacts, Touching, is_contact, pair_motion
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.contact.solver import solve
-from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.advance import advance_replica
 from jaxgran.dynamics.batch import checked_batch, shear_batch
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
+from jaxgran.dynamics.snapshot import Snapshot, snapshot_of
 from jaxgran.dynamics.step import closing_speed_bound
-from jaxgran.model.batches import Indexable, equal_values
-from jaxgran.model.cell import remap_tilt, wrap
 from jaxgran.model.checks import as_array, require, require_whole
-from jaxgran.model.display import are_numbers, text_of
 from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
 from jaxgran.model.state import State, require_state
 from jaxgran.model.status import Status
 
 _MOST_GRAIN_SNAPSHOTS = 10**9  # snapshots times grains of one series; memory is limited
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Snapshot(Indexable):
-    """A flow at the beginning of a time step, with the contacts of that step; a series has a
-    leading (times,) axis.
-
-    ===========  ===========  ====  ===============================================================
-    field        shape        unit  meaning
-    ===========  ===========  ====  ===============================================================
-    state        State        –     positions, and velocities before the contacts act
-    contacts     Contacts     –     the contact network of the step
-    impulses     (contacts,)  mσ/t  impulse J of each contact: grain i gains J n, grain j loses J n
-    timestep     ()           t     dt; the force of a contact is J/dt
-    shear_rate   ()           1/t   γ̇
-    restitution  ()           –     α
-    status       ()           –     worst status since the last snapshot, with that of its own solve
-    ===========  ===========  ====  ===============================================================
-    """
-
-    state: State
-    contacts: Contacts
-    impulses: Float[Array, "*times contacts"]
-    timestep: Float[Array, "*times"]
-    shear_rate: Float[Array, "*times"]
-    restitution: Float[Array, "*times"]
-    status: Int[Array, "*times"]
-
-    __eq__ = equal_values
-    _whole = "a series"
-
-    def __repr__(self) -> str:
-        numbers = self.impulses, self.status, self.timestep, self.shear_rate, self.restitution
-        if not are_numbers(*numbers) or np.ndim(self.impulses) < 1:
-            return text_of("Snapshot", {"state": self.state})
-        return text_of(
-            "Snapshot",
-            {
-                **({"times": len(self)} if self._axes else {}),
-                "grains": np.shape(self.state.positions)[-2],
-                "loaded_contacts": np.sum(np.asarray(self.impulses) > 0, axis=-1),
-                **{n: getattr(self, n) for n in ("timestep", "shear_rate", "restitution")},
-                "status": Status(int(np.max(self.status))).name,
-            },
-        )
-
-    @property
-    def _axes(self) -> tuple[int, ...]:
-        return np.shape(self.state.side)
 
 
 def snapshot(flow: ShearFlow, state: State, solver: ProjectedMethod = DEFAULT_SOLVER) -> Snapshot:
@@ -122,16 +65,6 @@ def contacts_now(flow: ShearFlow, state: State) -> tuple[Contacts, Int[Array, ""
     status = jnp.where(missing, Status.capacity, Status.ok).astype(jnp.int32)
     touching = Touching(pairs.i, pairs.j, pairs.reach, motion, contact)
     return touching.compacted(room, pack_bits(contact)).network(grains), status
-
-
-def snapshot_of(
-    flow: ShearFlow, state: State, contacts: Contacts, impulses: Array, status: Array
-) -> Snapshot:
-    """The snapshot of a flow, from its contacts and their solved impulses."""
-    timestep, shear_rate, restitution = (
-        jnp.asarray(x, state.side.dtype) for x in (flow.timestep, flow.shear_rate, flow.restitution)
-    )
-    return Snapshot(state, contacts, impulses, timestep, shear_rate, restitution, status)
 
 
 def snapshot_series(
@@ -193,7 +126,7 @@ def _later(
     flow: ShearFlow, numerics: Numerics, state: State, steps: Array
 ) -> tuple[State, Snapshot]:
     """The state after some time steps, and its snapshot with the worst status since."""
-    state, tally = advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
+    state, tally = advance_replica(flow, state, steps, numerics)
     new = snapshot(flow, state, numerics.solver)
     return state, replace(new, status=jnp.maximum(new.status, tally.status))
 
@@ -237,22 +170,3 @@ def _series_of_loaded(snapshots: Sequence[Snapshot]) -> Snapshot:
         return replace(snapshot, contacts=contacts, impulses=impulses)
 
     return jax.tree.map(lambda *x: np.stack(x), *map(with_loaded, snapshots, slots))
-
-
-def collided(snapshot: Snapshot) -> State:
-    """The state after the contacts of a snapshot have acted, before the free flight."""
-    state = snapshot.state
-    momenta = grain_impulses(snapshot.contacts, snapshot.impulses, state.grains.radii.size)
-    return replace(state, velocities=state.velocities + momenta / state.grains.masses[:, None])
-
-
-def flown(state: State, shear_rate: float | Array, time: float | Array) -> State:
-    """The state after free flight: grains keep their velocity in the laboratory frame, and the cell
-    is sheared.
-    """
-    cx, cy = state.velocities[:, 0], state.velocities[:, 1]
-    x, y = state.positions[:, 0], state.positions[:, 1]
-    moved = jnp.stack([x + time * (cx + shear_rate * y), y + time * cy], axis=-1)
-    tilt = remap_tilt(state.tilt + shear_rate * time)
-    velocities = jnp.stack([cx - shear_rate * time * cy, cy], axis=-1)
-    return replace(state, positions=wrap(moved, state.side, tilt), velocities=velocities, tilt=tilt)

@@ -1,6 +1,6 @@
 """One event of the engine ``Jax``: a free flight over whole steps, and the next contacts.
 
-Its functions take what does not change (``Advance``) and what does (``Carry``), and return a new
+Its functions take what does not change (``Constants``) and what does (``Carry``), and return a new
 ``Carry``:
 
 - ``refresh_lists``: new lists of near pairs.
@@ -13,7 +13,6 @@ In a batch, a replica that is finished or has no step to solve keeps what it has
 ``model.control_flow``.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -34,7 +33,6 @@ from jaxgran.contact.near_pairs import (
     separations_now,
 )
 from jaxgran.contact.network import (
-    Contacts,
     PairMotion,
     Touching,
     first_contact_time,
@@ -46,9 +44,11 @@ from jaxgran.contact.solver import single_contact, solve
 from jaxgran.dynamics.contact_sums import impulses_of, sums_of_contacts
 from jaxgran.dynamics.moving_contacts import contact_delays, delayed_shift, displaced, is_binary
 from jaxgran.dynamics.observer import (
+    Observe,
     ObserveNow,
     middle_of_flight,
     nothing_observed,
+    observe_at,
     with_contacts,
     with_flight,
 )
@@ -66,7 +66,7 @@ LONGEST_FLIGHT = 0.05  # strain; a bound on the change of the peculiar velocitie
 _SINGLE_SLOTS = 4  # for one contact: in one slot XLA would compute the terms once for each sum
 
 
-class Advance(NamedTuple):
+class Constants(NamedTuple):
     """What does not change in an advance; the last three are static."""
 
     flow: ShearFlow
@@ -74,12 +74,12 @@ class Advance(NamedTuple):
     side: Float[Array, ""]
     steps: Int[Array, ""]  # to fly in all
     solver: ProjectedMethod
-    free_flight: bool | Array = True  # whether steps without an approaching contact are jumped over
+    free_flight: bool = True  # whether steps without an approaching contact are jumped over
     # Numbers of contacts for which a solve is compiled, smallest first, beside that of all pairs;
     # none in loops for derivatives
     buffers: tuple[int, ...] = ()
     moving_contacts: bool = False  # whether derivatives include that a contact moves in time
-    observe: Callable[[State, Contacts, Array], Any] | None = None  # a function of the user's
+    observe: Observe | None = None
 
 
 class Carry(NamedTuple):
@@ -96,53 +96,53 @@ class Carry(NamedTuple):
     collisions_read: Float[Array, ""]  # collisions until the last reading of the velocity scales
 
 
-def start(advance: Advance, state: State) -> Carry:
+def start(constants: Constants, state: State) -> Carry:
     """The carry before the first step, without lists."""
     lists, dtype = no_lists(state.positions, state.tilt), state.positions.dtype
-    sums = empty_sums(dtype)._replace(status=status_at_start(advance.flow, state))
+    sums = empty_sums(dtype)._replace(status=status_at_start(constants.flow, state))
     now = Carry(
         lists=lists,
         pairs=PairMotion(*4 * [jnp.zeros_like(lists.near.reach)]),
         slack=lists.near.skin,
-        closing_speed=jnp.full_like(advance.side, jnp.inf),  # so that the lists are stale
+        closing_speed=jnp.full_like(constants.side, jnp.inf),  # so that the lists are stale
         velocities=state.velocities,
         step=jnp.int32(0),
         solved=jnp.bool_(False),
         sums=sums,
-        collisions_read=jnp.zeros_like(advance.side),
+        collisions_read=jnp.zeros_like(constants.side),
     )
-    observe_now = observer_of(advance, now)
+    observe_now = observer_of(constants, now)
     if observe_now is None:
         return now
     nothing = nothing_observed(observe_now, lists.near.reach.size, dtype)
     return now._replace(sums=sums._replace(user_sums=nothing))
 
 
-def unfinished(advance: Advance, now: Carry) -> Bool[Array, ""]:
+def unfinished(constants: Constants, now: Carry) -> Bool[Array, ""]:
     """Whether there is a step to fly, and all numbers are finite."""
-    return (now.step < advance.steps) & (now.sums.status < Status.nonfinite)
+    return (now.step < constants.steps) & (now.sums.status < Status.nonfinite)
 
 
-def needs_lists(advance: Advance, now: Carry) -> Bool[Array, ""]:
+def needs_lists(constants: Constants, now: Carry) -> Bool[Array, ""]:
     """Whether the near list may miss a contact of the next step, which looks θ·dt beyond itself."""
-    flow = advance.flow
+    flow = constants.flow
     suffices = now.slack >= now.closing_speed * (1 + flow.activation) * flow.timestep
-    return unfinished(advance, now) & ~suffices
+    return unfinished(constants, now) & ~suffices
 
 
-def refresh_lists(advance: Advance, now: Carry) -> Carry:
+def refresh_lists(constants: Constants, now: Carry) -> Carry:
     """A new near list where it is needed, and a new outer one where that is used up."""
-    stale = needs_lists(advance, now)
-    lists = refresh(now.lists, advance.grains, advance.side, stale)
+    stale = needs_lists(constants, now)
+    lists = refresh(now.lists, constants.grains, constants.side, stale)
     skin = lax.stop_gradient(lists.near.skin)
     separations = separations_now(lists.near, lists.frame)
     new = now._replace(
         lists=lists,
         pairs=pair_motion(
-            lists.near.i, lists.near.j, separations, now.velocities, advance.flow.shear_rate
+            lists.near.i, lists.near.j, separations, now.velocities, constants.flow.shear_rate
         ),
         slack=skin,
-        closing_speed=closing_speed_bound(advance.flow, advance.grains, now.velocities, skin),
+        closing_speed=closing_speed_bound(constants.flow, constants.grains, now.velocities, skin),
     )
     return where_active(stale, new, now)
 
@@ -162,59 +162,59 @@ def closing_speed_bound(
     return 2 * speed + flow.shear_rate * (2 * jnp.max(lax.stop_gradient(grains.radii)) + skin) / 2
 
 
-def event(advance: Advance, now: Carry) -> Carry:
+def event(constants: Constants, now: Carry) -> Carry:
     """A flight to the next step with an approaching contact, and the contacts of that step.
 
     A flight ends earlier where the near list does; a new list then comes before the contacts.
     """
-    flow, near = advance.flow, now.lists.near
-    going = unfinished(advance, now)
-    jump = _steps_to_fly(advance, now)
-    flown = fly(advance, now, jump)
+    flow, near = constants.flow, now.lists.near
+    going = unfinished(constants, now)
+    jump = _steps_to_fly(constants, now)
+    flown = fly(constants, now, jump)
 
     spare = flown.slack - now.closing_speed * flow.activation * flow.timestep
     rounding = 16 * jnp.finfo(spare.dtype).eps * near.skin  # of the slack, summed over flights
     expired = spare < -rounding
-    needs_solve = going & (flown.step < advance.steps) & ~(expired & (jump > 0))
-    collided = collide(advance, flown, needs_solve)
+    needs_solve = going & (flown.step < constants.steps) & ~(expired & (jump > 0))
+    collided = collide(constants, flown, needs_solve)
 
     missing = near.overflow | (expired & needs_solve)
     listed = jnp.where(missing, Status.capacity, Status.ok)
     status = jnp.where(jnp.isfinite(now.closing_speed), listed, Status.nonfinite).astype(jnp.int32)
     sums = collided.sums._replace(status=jnp.maximum(collided.sums.status, status))
-    speed = closing_speed_bound(flow, advance.grains, collided.velocities, near.skin)
+    speed = closing_speed_bound(flow, constants.grains, collided.velocities, near.skin)
     after = collided._replace(closing_speed=speed, solved=needs_solve, sums=sums)
-    return where_active(going, _with_readings(advance, after), now)
+    return where_active(going, _with_readings(constants, after), now)
 
 
-def _steps_to_fly(advance: Advance, now: Carry) -> Int[Array, ""]:
+def _steps_to_fly(constants: Constants, now: Carry) -> Int[Array, ""]:
     """Steps to the next contact that the near list holds; at least one if the present one is
     solved.
     """
-    flow, least = advance.flow, now.solved.astype(jnp.int32)
+    flow, least = constants.flow, now.solved.astype(jnp.int32)
     time, closest = first_contact_time(now.pairs, now.lists.near.reach)
     steps = jnp.maximum(first_step(time, flow.timestep, flow.activation), least.astype(time.dtype))
     to_contact = smallest(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
     longest = jnp.divide(LONGEST_FLIGHT, flow.shear_rate) / flow.timestep
     of_list = now.slack / now.closing_speed / flow.timestep - flow.activation
     jump = jnp.minimum(to_contact, jnp.floor(jnp.minimum(of_list, longest)))
-    wanted = jnp.where(advance.free_flight, jump, 0)
-    remaining = advance.steps - now.step
+    wanted = jnp.where(constants.free_flight, jump, 0)
+    remaining = constants.steps - now.step
     return jnp.clip(
         jnp.minimum(wanted, remaining.astype(wanted.dtype)).astype(jnp.int32), least, remaining
     )
 
 
-def fly(advance: Advance, now: Carry, steps: Int[Array, ""]) -> Carry:
+def fly(constants: Constants, now: Carry, steps: Int[Array, ""]) -> Carry:
     """Exact free flight (SLLOD) over a number of steps: the laboratory velocities stay as they
     are.
     """
-    shear_rate = advance.flow.shear_rate
-    time = steps.astype(now.slack.dtype) * advance.flow.timestep
-    sums = _with_flight(now.sums, now.velocities, advance.grains, steps, time, shear_rate)
-    if advance.observe is not None:
-        middle = middle_of_flight(sums.user_sums, steps) * advance.flow.timestep
-        observe_now = observer_of(advance, _moved(now, middle, shear_rate))
+    shear_rate = constants.flow.shear_rate
+    time = steps.astype(now.slack.dtype) * constants.flow.timestep
+    sums = _with_flight(now.sums, now.velocities, constants.grains, steps, time, shear_rate)
+    if constants.observe is not None:
+        middle = middle_of_flight(sums.user_sums, steps) * constants.flow.timestep
+        observe_now = observer_of(constants, _moved(now, middle, shear_rate))
         assert observe_now is not None
         sums = sums._replace(user_sums=with_flight(sums.user_sums, observe_now, steps))
     return _moved(now, time, shear_rate)._replace(
@@ -269,26 +269,26 @@ class Collision(NamedTuple):
     shift: Float[Array, "grains 2"] | None  # of ``moving_contacts``
 
 
-def collide(advance: Advance, now: Carry, needs_solve: Bool[Array, ""]) -> Carry:
+def collide(constants: Constants, now: Carry, needs_solve: Bool[Array, ""]) -> Carry:
     """The contacts of one step change the velocities; not where none approaches or no step needs
     it.
 
     The contacts are compacted from the near list into the smallest buffer that holds them, and
     solved and summed there; more than the largest buffer holds are solved and summed on the list.
     """
-    near, grains, flow = now.lists.near, advance.grains, advance.flow
+    near, grains, flow = now.lists.near, constants.grains, constants.flow
     look_ahead = flow.activation * flow.timestep
     all_contacts, approaching = is_contact(now.pairs, near.reach, look_ahead)
     acts = needs_solve & jnp.any(pack_bits(approaching) > 0)
     contact, motion, delays = all_contacts & acts, now.pairs, None
-    if advance.moving_contacts:
+    if constants.moving_contacts:
         delays = contact_delays(now.pairs, near.reach, approaching, flow.timestep)
         motion = now.pairs.moved(jnp.where(is_binary(near, contact, grains), delays, 0))
     touching, words = Touching(near.i, near.j, near.reach, motion, contact), pack_bits(contact)
 
-    sizes = (1, *advance.buffers) if advance.buffers else ()
-    in_buffer = partial(_collision_in_buffer, advance, now, touching, words)
-    on_list = partial(_collision, advance, now, touching, delays)
+    sizes = (1, *constants.buffers) if constants.buffers else ()
+    in_buffer = partial(_collision_in_buffer, constants, now, touching, words)
+    on_list = partial(_collision, constants, now, touching, delays)
     programs = [*(partial(in_buffer, size) for size in sizes), on_list]
     branch = jnp.sum(count_bits(words) > jnp.asarray([0, *sizes], jnp.int32), dtype=jnp.int32)
     collision = switch_replica(branch, _no_collision(now, delays), programs)
@@ -321,18 +321,18 @@ def _no_collision(now: Carry, delays: Array | None) -> Collision:
 
 
 def _collision_in_buffer(
-    advance: Advance, now: Carry, touching: Touching, words: Array, size: int, active: Array
+    constants: Constants, now: Carry, touching: Touching, words: Array, size: int, active: Array
 ) -> Collision:
     """What no more than ``size`` contacts do; a single one is solved in closed form."""
     if size > 1:
-        return _collision(advance, now, touching.compacted(size, words), None, active)
+        return _collision(constants, now, touching.compacted(size, words), None, active)
     return _collision(
-        advance, now, touching.compacted(_SINGLE_SLOTS, words), None, active, single=True
+        constants, now, touching.compacted(_SINGLE_SLOTS, words), None, active, single=True
     )
 
 
 def _collision(
-    advance: Advance,
+    constants: Constants,
     now: Carry,
     touching: Touching,
     delays: Array | None,
@@ -340,16 +340,16 @@ def _collision(
     single: bool = False,
 ) -> Collision:
     """What contacts do, from their network and its solution."""
-    flow, grains = advance.flow, advance.grains
+    flow, grains = constants.flow, constants.grains
     network = touching.network(grains)
     operator = NetworkOperator(network, grains.radii.size)
     if single:
         solution = single_contact(operator)
     else:
-        solution = solve(operator, flow.shear_rate, advance.solver, active)
+        solution = solve(operator, flow.shear_rate, constants.solver, active)
     impulses = impulses_of(flow, network, grains, solution)
     contact_sums, largest_overlap = sums_of_contacts(flow, touching.reach, network, impulses)
-    user_sums, observe_now = now.sums.user_sums, observer_of(advance, now)
+    user_sums, observe_now = now.sums.user_sums, observer_of(constants, now)
     if observe_now is not None:
         user_sums = with_contacts(user_sums, observe_now, network, impulses.contacts)
     shift = None if delays is None else delayed_shift(delays, network, grains, impulses)
@@ -370,28 +370,27 @@ def _with_collision(sums: RunningSums, collision: Collision, acts: Array) -> Run
     )
 
 
-def observer_of(advance: Advance, now: Carry) -> ObserveNow | None:
+def observer_of(constants: Constants, now: Carry) -> ObserveNow | None:
     """What the user observes now, given contacts and impulses; None where nothing is observed."""
-    observe = advance.observe
-    if observe is None:
+    if constants.observe is None:
         return None
-    return lambda contacts, impulses: observe(_state_of(advance, now), contacts, impulses)
+    return observe_at(constants.observe, constants.flow, _state_of(constants, now))
 
 
-def _state_of(advance: Advance, now: Carry) -> State:
-    positions, tilt = present(now.lists, advance.side)
-    return State(advance.grains, positions, now.velocities, advance.side, tilt)
+def _state_of(constants: Constants, now: Carry) -> State:
+    positions, tilt = present(now.lists, constants.side)
+    return State(constants.grains, positions, now.velocities, constants.side, tilt)
 
 
-def _with_readings(advance: Advance, now: Carry) -> Carry:
+def _with_readings(constants: Constants, now: Carry) -> Carry:
     """With readings of the velocity scales where it is time for some."""
-    if not advance.buffers:  # loops for derivatives are too short for a second reading
+    if not constants.buffers:  # loops for derivatives are too short for a second reading
         return now
     sums, collisions_read = now.sums, now.collisions_read
-    due = sums.collisions - collisions_read >= READ_AFTER * advance.grains.radii.size / 2
+    due = sums.collisions - collisions_read >= READ_AFTER * constants.grains.radii.size / 2
 
     def read() -> tuple[RunningSums, Array]:
-        state = _state_of(advance, now)
+        state = _state_of(constants, now)
         read_now = sums.with_reading(readings(state)), sums.collisions
         return where_active(due, read_now, (sums, collisions_read))
 

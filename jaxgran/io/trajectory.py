@@ -54,7 +54,8 @@ from jaxgran.analysis.series import series
 from jaxgran.contact.clusters import cluster_labels
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.engine import checked_numerics
-from jaxgran.dynamics.snapshots import Snapshot, snapshots_from
+from jaxgran.dynamics.snapshot import Snapshot
+from jaxgran.dynamics.snapshots import snapshots_from
 from jaxgran.files import atomic_write, other_version
 from jaxgran.io.paths import require_place
 from jaxgran.model.batches import equal_values

@@ -9,7 +9,7 @@ from heapq import heappop, heappush
 import jax
 
 from jaxgran.dynamics.batch import predicted_cost
-from jaxgran.dynamics.engine import in_lockstep
+from jaxgran.dynamics.batching import in_lockstep
 from jaxgran.maps.replica import Key
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.flow import ShearFlow
@@ -83,14 +83,14 @@ def batches(settings: MapSettings, without: Container[Key] = ()) -> list[list[Ke
 
 
 def batch_size(grains: int, count: int) -> int:
-    """Replicas of a batch: one for each device of a processor, as many as fit into half the memory
-    of an accelerator.
+    """Replicas of a batch: one on a processor, as many as fit into half the memory of an
+    accelerator.
     """
-    devices, device = jax.device_count(), jax.local_devices()[0]
+    device = jax.local_devices()[0]
     if device.platform == "cpu":
-        return min(devices, count)
+        return 1
     memory = (device.memory_stats() or {}).get("bytes_limit", _DEFAULT_MEMORY)
     per_replica = (
         _GRAIN_BYTES * max(64, 1 << (grains - 1).bit_length()) + _PAIR_BYTES * min(grains, 512) ** 2
     )
-    return int(max(1, min(count, _SHARE_OF_MEMORY * memory * devices / per_replica)))
+    return int(max(1, min(count, _SHARE_OF_MEMORY * memory / per_replica)))

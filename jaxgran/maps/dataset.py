@@ -4,13 +4,12 @@ the run.
 
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
 import xarray as xr
 
-from jaxgran.dynamics.engine import select_engine, solver_in_use
+from jaxgran.dynamics.engine import select_engine
 from jaxgran.maps.attributes import to_attrs
 from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.conventions import CONVENTIONS, follow_conventions
@@ -153,14 +152,5 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
 
 def what_runs(settings: MapSettings) -> dict[str, str]:
     """The attributes ``engine`` and ``solver``: what this process takes for the flows of a map."""
-    flow, of_sample = settings.flows()[0], "" if settings.observe is None else "observe"
-    engines = [
-        select_engine(replace(flow, grains=grains), settings.numerics, option=option)
-        for grains in settings.sizes
-        for option in ("", of_sample)
-    ]
-    solvers = [solver_in_use(engine, settings.solver) for engine in engines]
-    return {
-        "engine": ", ".join(dict.fromkeys(engine.name for engine in engines)),
-        "solver": ", ".join(dict.fromkeys(solvers)),
-    }
+    engine = select_engine(settings.numerics)
+    return {"engine": engine.name, "solver": engine.solver_in_use(settings.solver)}

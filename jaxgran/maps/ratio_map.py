@@ -17,7 +17,8 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.contact.projected_methods import ProjectedMethod
-from jaxgran.dynamics.engine import Engine, in_lockstep
+from jaxgran.dynamics.batching import in_lockstep
+from jaxgran.dynamics.engine import Engine
 from jaxgran.environment import usable_cores
 from jaxgran.maps.automatic import chosen_settings, expected_costs, expected_seconds
 from jaxgran.maps.checkpoint import Checkpoint

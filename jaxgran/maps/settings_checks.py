@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, require_solver
 from jaxgran.dynamics.batch import stack
-from jaxgran.dynamics.engine import checked_numerics, select_engine
+from jaxgran.dynamics.engine import Jax, Numba, checked_numerics, select_engine
 from jaxgran.io.paths import require_place
 from jaxgran.model.checks import (
     InputError,
@@ -184,9 +184,11 @@ def _check_timesteps(settings: MapSettings, flows: ShearFlow) -> None:
 
 def require_engine(settings: MapSettings) -> None:
     """Raise an InputError if the engine that is asked for cannot run this map here."""
-    if settings.engine is not None:
-        option = "" if settings.observe is None else "observe"
-        select_engine(settings.flows()[0], settings.numerics, option=option)
+    if settings.engine is None:
+        return
+    if settings.engine not in (Jax(), Numba()):
+        raise refused("engine", settings.engine, "must be Jax(), Numba() or None, without options")
+    select_engine(settings.numerics)
 
 
 def check_run(run: RunOptions) -> None:

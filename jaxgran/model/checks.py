@@ -189,6 +189,12 @@ def require_flag(name: str, value: Any) -> None:
         raise refused(name, value, "must be True or False")
 
 
+def require_function(name: str, value: Any) -> None:
+    """Raise an InputError unless the value is a function or None."""
+    if value is not None and not callable(value):
+        raise refused(name, value, "must be a function or None")
+
+
 def is_traced(*values: Any) -> bool:
     """Whether JAX traces a part of these pytrees, whose numbers are then unknown in Python."""
     import jax

@@ -1,47 +1,54 @@
 """Real control flow for a batch of replicas.
 
 Under ``vmap`` a batched predicate turns ``lax.cond`` into a ``select``, which computes both
-branches. Reduced over the named axis ``AXIS``, the predicate is one scalar for the whole batch, and
-only one branch is computed. Outside a batch, and under ``lax.map``, there is no such axis: the
-functions below then return their argument unchanged.
+branches, and a loop into one that selects in every iteration. A predicate that passes through
+``any_replica`` stays one scalar for the whole batch, so only one branch is computed. Then
+``where_active`` keeps what is finished in a replica while others of its batch go on. Outside a
+batch both change nothing.
 """
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_batching import custom_vmap
 
-AXIS = "jaxgran_replica"  # a name that no axis of a user has
 T = TypeVar("T")
 
 
-def in_batch() -> bool:
-    """Whether the code that JAX traces runs under ``vmap(axis_name="jaxgran_replica")``."""
-    try:
-        lax.axis_index(AXIS)
-    except NameError:
-        return False
-    return True
-
-
+@custom_vmap
 def any_replica(predicate: jax.Array) -> jax.Array:
     """Whether the predicate holds in at least one replica of the batch; the predicate itself
     outside a batch.
     """
-    return lax.pmax(predicate.astype(jnp.int32), AXIS) > 0 if in_batch() else predicate
+    return predicate
+
+
+@any_replica.def_vmap
+def _(size: int, batched: list[bool], predicate: jax.Array) -> tuple[jax.Array, bool]:
+    return any_replica(jnp.any(predicate, axis=0) if batched[0] else predicate), False
+
+
+@custom_vmap
+def _takes_part(active: jax.Array) -> jax.Array:
+    """Whether a replica takes part in an iteration: outside a batch always, as its loop ends with
+    it.
+    """
+    return jnp.ones_like(active)
+
+
+@_takes_part.def_vmap
+def _(size: int, batched: list[bool], active: jax.Array) -> tuple[jax.Array, bool]:
+    return (active, True) if batched[0] else (_takes_part(active), False)
 
 
 def where_active(active: jax.Array, new: T, old: T) -> T:
-    """``new`` in active replicas and ``old`` in finished ones.
-
-    Outside a batch the loop of a finished replica has ended, so the result is always ``new``.
-    """
-    if not in_batch():
-        return new
-    return jax.tree.map(lambda a, b: jnp.where(active, a, b), new, old)
+    """``new`` in active replicas and ``old`` in finished ones; outside a batch always ``new``."""
+    takes_part = _takes_part(active)
+    return jax.tree.map(partial(jnp.where, takes_part), new, old)
 
 
 def switch_replica(
@@ -52,16 +59,12 @@ def switch_replica(
     A branch is given whether this replica takes it. A batch computes each branch that one of its
     replicas takes, and no other, so that the result of a replica does not depend on the batch.
     """
-    if not in_batch():
-        taken = jnp.bool_(True)
-        return lax.switch(branch, [lambda: default, *(partial(take, taken) for take in branches)])
-    result = default
+
+    def taken(take: Callable[[jax.Array], T], mine: jax.Array, result: T) -> T:
+        return where_active(mine, take(mine), result)
+
+    result: Any = default
     for number, take in enumerate(branches, 1):
         mine = branch == number
-        compute = partial(_taken, take, mine, result)
-        result = lax.cond(any_replica(mine), compute, partial(lambda same: same, result))
+        result = lax.cond(any_replica(mine), partial(taken, take, mine), lambda same: same, result)
     return result
-
-
-def _taken(take: Callable[[jax.Array], T], mine: jax.Array, result: T) -> T:
-    return where_active(mine, take(mine), result)

@@ -291,7 +291,8 @@ def flow_of_state(flow: ShearFlow) -> ShearFlow:
     if not is_traced(flow.packing_fraction):
         return flow
     numbers = {name: getattr(flow, name) for name in _TRACED_FIELDS}
-    numbers["packing_fraction"] = _of_state(flow.packing_fraction)
+    # A copy: JAX refuses a batch of NumPy numbers, over which vmap maps, in a custom derivative.
+    numbers["packing_fraction"] = _of_state(jnp.array(flow.packing_fraction))
     return _unflatten((flow.grains,), numbers.values())
 
 

@@ -20,7 +20,7 @@ from matplotlib.patches import Patch
 
 from jaxgran.analysis.contacts import ForceNetwork, force_network
 from jaxgran.analysis.series import series
-from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.checks import InputError, require_untraced, short_repr
 from jaxgran.plotting.encoding import (

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from jaxgran.analysis.contacts import ForceNetwork
-from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.files import atomic_write
 from jaxgran.io.paths import require_place
 from jaxgran.model.checks import InputError, short_repr

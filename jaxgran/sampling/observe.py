@@ -4,10 +4,7 @@ digest.
 
 import hashlib
 import re
-import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import replace
-from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -17,23 +14,15 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from jaxgran.cache.persistent_jit import persistent_jit
-from jaxgran.contact.network import MOST_CONTACTS, Contacts
-from jaxgran.dynamics.advance import advance, register_numba
+from jaxgran.contact.network import MOST_CONTACTS
+from jaxgran.dynamics.advance import advance_replica
 from jaxgran.dynamics.batch import predicted_cost, run_batch
 from jaxgran.dynamics.engine import Numerics
-from jaxgran.dynamics.observed_advance import advance_observed
-from jaxgran.dynamics.observer import nothing_observed, without_contacts
-from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
+from jaxgran.dynamics.observer import Observe, nothing_observed, observe_at, without_contacts
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
-from jaxgran.model.status import Status
-
-_NEEDS_VALUES = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
-Observe = Callable[[Snapshot], Any]  # returns a pytree of arrays to average
 
 # Advances each replica of a batch by its number of steps, (replicas,), and a wrapper that adds
 # reports or records and leaves the states alone.
@@ -77,10 +66,9 @@ def advance_batch(
     """
     strain = np.asarray(steps) * np.asarray(flow.timestep)
     costs = predicted_cost(flow) * strain if threads > 1 else None
-    run = partial(run_batch, batch=(flow, state, steps), costs=costs, threads=threads)
-    if observe is None:
-        return run(_advance_replica, shared=(numerics,))
-    return run(_observe_replica, shared=(numerics,), static=(observe,))
+    return run_batch(
+        _advance_replica, (flow, state, steps), (numerics,), (observe,), costs, threads
+    )
 
 
 def reporting(advance: ObserveBatch, report: Report) -> ObserveBatch:
@@ -100,24 +88,7 @@ def reporting(advance: ObserveBatch, report: Report) -> ObserveBatch:
     return advance_and_report
 
 
-def advance_and_observe(
-    flow: ShearFlow,
-    state: State,
-    steps: Array,
-    numerics: Numerics,
-    observe: Observe | None = None,
-) -> tuple[State, Tally]:
-    """``advance``, with the sums of what a function observes in ``Tally.observed``."""
-    if observe is None:
-        return advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
-    end, tally, sums = advance_observed(
-        flow, numerics, state, steps, partial(_observe_step, observe)
-    )
-    return end, replace(tally, observed=sums)
-
-
-_advance_replica = persistent_jit(advance_and_observe, register_numba)
-_observe_replica = jax.jit(advance_and_observe, static_argnames="observe")
+_advance_replica = jax.jit(advance_replica, static_argnames="observe")
 
 
 def observed_shapes(observe: Observe, flow: ShearFlow) -> Any:
@@ -129,7 +100,7 @@ def observed_shapes(observe: Observe, flow: ShearFlow) -> Any:
     """
 
     def sums(state: State) -> Any:
-        now = partial(_observe_step, observe, flow, state)
+        now = observe_at(observe, flow, state)
         return nothing_observed(now, MOST_CONTACTS * flow.grains, state.positions.dtype).sums
 
     return jax.eval_shape(sums, _abstract_state(flow.grains))
@@ -146,7 +117,7 @@ def digest_of(observe: Observe, flow: ShearFlow) -> str:
     """
 
     def without(state: State) -> Any:
-        return without_contacts(partial(_observe_step, observe, flow, state), state.positions.dtype)
+        return without_contacts(observe_at(observe, flow, state), state.positions.dtype)
 
     jaxpr, results = jax.make_jaxpr(without, return_shape=True)(_abstract_state(flow.grains))
     text = re.sub(" at 0x[0-9a-f]+", "", f"{jaxpr} {results}")  # addresses of functions
@@ -172,28 +143,6 @@ def _constants(part: Any) -> Iterator[np.ndarray]:
             yield from _constants(element)
     elif isinstance(part, (np.ndarray, jax.Array)):
         yield np.asarray(part)
-
-
-def _observe_step(
-    observe: Observe, flow: ShearFlow, state: State, contacts: Contacts, impulses: Array
-) -> Any:
-    """The result of ``observe`` for the contacts and impulses of one step."""
-    snapshot = snapshot_of(flow, state, contacts, impulses, jnp.int32(Status.ok))
-    try:
-        return observe(snapshot)
-    except _NEEDS_VALUES as error:
-        raise InputError(
-            "observe must compute with jax.numpy, since JAX traces its snapshot, and "
-            f"{_line_of(observe, error)} needs the values: jnp.sum and jnp.where take the place of "
-            "functions of NumPy, float() and if."
-        ) from None
-
-
-def _line_of(observe: Observe, error: Exception) -> str:
-    """The line of a user's function that raised an error; "it" where that is not known."""
-    file = getattr(getattr(observe, "__code__", None), "co_filename", "")
-    lines = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
-    return f"line {lines[-1].lineno}, {short_repr(lines[-1].line)}," if lines else "it"
 
 
 def _abstract_state(grains: int) -> State:

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxgran.dynamics.engine import Numerics
-from jaxgran.dynamics.snapshots import Snapshot, snapshots_from
+from jaxgran.dynamics.snapshot import Snapshot
+from jaxgran.dynamics.snapshots import snapshots_from
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow, steps_of_strain
 from jaxgran.model.state import State

@@ -8,14 +8,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
-from jaxgran.dynamics.advance import advance_blocks
+from jaxgran.dynamics.advance import advance_replica, engine_of
 from jaxgran.dynamics.batch import Arguments, checked_batch, shear_batch
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics, select_engine
 from jaxgran.dynamics.interruption import waited
+from jaxgran.dynamics.observer import Observe
 from jaxgran.dynamics.tally import Tally
 from jaxgran.environment import usable_threads
 from jaxgran.model.checks import (
@@ -23,8 +23,8 @@ from jaxgran.model.checks import (
     as_array,
     is_traced,
     require,
+    require_function,
     require_whole,
-    short_repr,
     two_digits,
 )
 from jaxgran.model.flow import (
@@ -38,7 +38,7 @@ from jaxgran.model.flow import (
 from jaxgran.model.state import State, require_state
 from jaxgran.sampling.blocks import advance_by_block, sample_of_blocks
 from jaxgran.sampling.correlation_strain import length_status, total_mass
-from jaxgran.sampling.observe import Observe, advance_and_observe, advance_batch
+from jaxgran.sampling.observe import advance_batch
 from jaxgran.sampling.sample import BLOCKS, Sample
 
 MOST_BLOCKS = 10**6
@@ -125,17 +125,15 @@ def sample(
     check = partial(_require_sheared_state, blocks)
     batch = checked_batch(check, flow, state, strain)
     numerics = checked_numerics(solver, engine)
-    for name, function in (("observe", observe), ("callback", callback)):
-        if function is not None and not callable(function):
-            raise InputError(f"{name} must be a function or None, not {short_repr(function)}.")
+    require_function("observe", observe)
+    require_function("callback", callback)
     if callback is None:
         if batch is None:
             flow, strain = in_dtype((flow_of_state(flow), strain), state.side.dtype)
             return waited(_sample(flow, state, strain, numerics, blocks, observe))
-        option = "" if observe is None else "observe"
         flows, states, strains = batch
         flows, strains = in_dtype((flow_of_state(flows), strains), states.side.dtype)
-        return shear_batch(_sample, numerics, (flows, states, strains), (blocks, observe), option)
+        return shear_batch(_sample, numerics, (flows, states, strains), (blocks, observe))
     if is_traced(flow, numerics, state, strain):
         raise InputError("callback must be None where a sample is transformed, as by jax.jit.")
     replicas = batch or checked_batch(
@@ -173,17 +171,10 @@ def _sample(
 ) -> tuple[State, Sample]:
     """The sample of one replica, in one compiled program."""
     steps = steps_of_blocks(steps_of_strain(flow, strain), blocks)
-    if observe is None:
-        state, tally = advance_blocks(flow, numerics, state, steps)
-    else:
-        state, tally = lax.scan(
-            lambda state, steps: advance_and_observe(flow, state, steps, numerics, observe),
-            state,
-            steps,
-        )
-    engine = select_engine(flow, numerics, state, "" if observe is None else "observe").name
-    measured = Sample(tally, state.side**2, total_mass(state.grains), flow, engine)
-    return state, _with_length(measured)
+    end, tally = advance_replica(flow, state, steps, numerics, observe)
+    engine = engine_of(flow, numerics, state, observe).name
+    measured = Sample(tally, end.side**2, total_mass(end.grains), flow, engine)
+    return end, _with_length(measured)
 
 
 def _sample_with_callback(
@@ -196,7 +187,7 @@ def _sample_with_callback(
 ) -> tuple[State, Sample]:
     """The sample of a batch, or of a batch of a single replica, block by block."""
     flow, start, strain = batch
-    engine = select_engine(flow, numerics, start, "" if observe is None else "observe").name
+    engine = select_engine(numerics, start).name
 
     def result(end: State, tallies: Sequence[Tally]) -> tuple[State, Sample]:
         measured = _with_length(replace(sample_of_blocks(flow, end, tallies), engine=engine))

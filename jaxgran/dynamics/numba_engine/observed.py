@@ -1,29 +1,28 @@
-"""Advances one replica and sums what a user's function observes, with the engine ``Numba`` or
-``Jax``.
+"""What a user's function observes while the numba engine advances a flow, from its records."""
 
-The numba engine does not call the function. It records the steps that it visits until the buffer of
-records is full; then JAX applies the function to the records, and the engine goes on where it was
-suspended. So only the function is compiled, not an engine, and the trajectory is that of
-``advance`` to the bit.
-"""
-
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.core import Tracer
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
 from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.network import MOST_CONTACTS, Contacts
 from jaxgran.contact.projected_methods import ProjectedMethod
-from jaxgran.dynamics.advance import NumbaCall, call_numba, numba_memory
-from jaxgran.dynamics.engine import Jax, Numerics, select_engine
-from jaxgran.dynamics.jax_engine import ended, observe_by_jax
-from jaxgran.dynamics.observer import Observe, added, nothing_observed, without_contacts
-from jaxgran.dynamics.snapshots import flown
+from jaxgran.dynamics.jax_engine import ended
+from jaxgran.dynamics.numba_engine import layout
+from jaxgran.dynamics.numba_engine.call import NumbaCall, call_numba, numba_memory
+from jaxgran.dynamics.observer import (
+    Observe,
+    added,
+    nothing_observed,
+    observe_at,
+    without_contacts,
+)
+from jaxgran.dynamics.snapshot import flown
 from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
 from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow
@@ -38,41 +37,8 @@ _MOST_BYTES = 2**26  # of the records of one call, above 170,000 grains those of
 _FEW = 16  # grains for a slot in the smaller one of two buffers for contacts
 
 
-def advance_observed(
-    flow: ShearFlow, numerics: Numerics, state: State, steps: Int[Array, ""], observe: Observe
-) -> tuple[State, Tally, Any]:
-    """``advance``, and the sum over all its time steps of what a function finds in them, see
-    ``observer``.
-
-    Raises:
-      InputError: the engine asked for cannot do this, or the function returns something else than
-        sums.
-    """
-    engine = select_engine(flow, numerics, state, "observe")
-    if isinstance(engine, Jax) or _depends_on_traced(observe, flow, state):
-        return observe_by_jax(flow, numerics.solver, state, steps, observe)
-    return _recorded(observe, flow, numerics.solver, state, steps)
-
-
-def _depends_on_traced(observe: Observe, flow: ShearFlow, state: State) -> bool:
-    """Whether the function uses values from outside that JAX traces, whose derivatives
-    ``_recorded`` would not see.
-    """
-
-    def observation(flow: ShearFlow, state: State) -> Any:
-        return without_contacts(partial(observe, flow, state), state.positions.dtype)
-
-    # First what it returns is judged: other things than numbers cannot be traced.
-    nothing_observed(
-        partial(observe, flow, state), MOST_CONTACTS * flow.grains, state.positions.dtype
-    )
-    return any(isinstance(x, Tracer) for x in jax.make_jaxpr(observation)(flow, state).consts)
-
-
 def records_of_call(grains: int) -> int:
     """How many records a call of the numba engine keeps, within ``_MOST_BYTES``."""
-    from jaxgran.dynamics.numba_engine import layout
-
     return max(_LEAST_ROOM, min(_MOST_ROOM, _MOST_BYTES // (8 * layout.record_numbers(grains))))
 
 
@@ -86,12 +52,15 @@ class _Progress(NamedTuple):
     memory: Array
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _recorded(
+def observe_by_numba(
     observe: Observe, flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
-) -> tuple[State, Tally, Any]:
-    """``advance_observed`` with the numba engine; its derivatives are those of the engine
-    ``Jax``.
+) -> tuple[State, Tally]:
+    """Advance one replica, and sum over all time steps what a function finds in them.
+
+    The engine does not call the function. It records the steps that it visits until the buffer of
+    records is full; then JAX applies the function to the records, and the engine goes on where it
+    was suspended. So only the function is compiled, not an engine, and the trajectory is that of
+    ``advance_by_numba`` to the bit.
     """
 
     room = records_of_call(flow.grains)
@@ -104,27 +73,21 @@ def _recorded(
         return _Progress(call.suspended > 0, call.end, sums, call.suspended, call.memory)
 
     dtype = state.positions.dtype
-    at_start = partial(observe, flow, state)
+    at_start = observe_at(observe, flow, state)
     sums = empty_sums(dtype)._replace(
         user_sums=nothing_observed(at_start, MOST_CONTACTS * flow.grains, dtype).sums
     )
     memory = jnp.zeros(numba_memory(flow).shape, dtype)
     start = _Progress(jnp.bool_(True), state, sums, jnp.zeros((), dtype), memory)
     end, sums = lax.while_loop(lambda now: now.unfinished, called, start)[1:3]
-    return *ended(state, end.positions, end.tilt, end.velocities, sums), sums.user_sums
-
-
-@_recorded.defjvp
-def _recorded_jvp(observe: Observe, primals: tuple, tangents: tuple) -> tuple:
-    return jax.jvp(partial(observe_by_jax, observe=observe), primals, tangents)
+    after, tally = ended(state, end.positions, end.tilt, end.velocities, sums)
+    return after, replace(tally, observed=sums.user_sums)
 
 
 def _with_records(
     flow: ShearFlow, state: State, observe: Observe, user_sums: Any, call: NumbaCall, steps: Array
 ) -> Any:
     """The user sums with what is found in the records of a call, up to the step ``steps``."""
-    from jaxgran.dynamics.numba_engine import layout
-
     records, count = call.records, call.recorded
     dtype = records.dtype
     timestep, shear_rate = (jnp.asarray(x, dtype) for x in (flow.timestep, flow.shear_rate))
@@ -138,9 +101,8 @@ def _with_records(
         def with_contacts(slots: int) -> tuple[Any, Array]:
             contacts, impulses = _recorded_contacts(record, state.grains, slots)
             kicks = grain_impulses(contacts, impulses, flow.grains) / state.grains.masses[:, None]
-            return added(
-                user_sums, observe(flow, before, contacts, impulses), jnp.ones((), dtype)
-            ), kicks
+            found = observe_at(observe, flow, before)(contacts, impulses)
+            return added(user_sums, found, jnp.ones((), dtype)), kicks
 
         size = jnp.sum(
             record[layout.RECORD_CONTACTS] > jnp.asarray([0, *sizes[:-1]], dtype), dtype=jnp.int32
@@ -161,15 +123,13 @@ def _with_records(
         flight, solved = until - record[layout.RECORD_STEP], record[layout.RECORD_SOLVED]
         middle = flown(after, shear_rate, (flight + solved) / 2 * timestep)
         weight = jnp.maximum(flight - solved, 0)
-        return added(sums, without_contacts(partial(observe, flow, middle), dtype), weight)
+        return added(sums, without_contacts(observe_at(observe, flow, middle), dtype), weight)
 
     return lax.fori_loop(0, count, with_record, user_sums)
 
 
 def _recorded_state(record: Array, state: State) -> State:
     """The state of a record, before its contacts act."""
-    from jaxgran.dynamics.numba_engine import layout
-
     tilt, count = record[layout.RECORD_TILT], state.grains.radii.size
     numbers = record[layout.RECORD_HEAD : layout.RECORD_HEAD + layout.RECORD_OF_GRAIN * count]
     motion = numbers.reshape(count, layout.RECORD_OF_GRAIN)
@@ -179,8 +139,6 @@ def _recorded_state(record: Array, state: State) -> State:
 
 def _recorded_contacts(record: Array, grains: Grains, slots: int) -> tuple[Contacts, Array]:
     """The contacts of a record and their impulses, in so many slots."""
-    from jaxgran.dynamics.numba_engine import layout
-
     first = layout.RECORD_HEAD + layout.RECORD_OF_GRAIN * grains.radii.size
     rows = record[first : first + slots * layout.RECORD_OF_CONTACT].reshape(
         slots, layout.RECORD_OF_CONTACT
