@@ -39,7 +39,6 @@ from benchmarks.peers import event_driven, lammps
 from benchmarks.peers.jaxgran_itself import discs_of
 from benchmarks.peers.problem import Flow, Stress, blocks_of, relative
 from benchmarks.peers.problem import averages as stress_means
-from jaxgran.contact.delassus import diagonal
 from jaxgran.dynamics.batch import stack
 from jaxgran.environment import usable_cores
 from jaxgran.model.choices import MAX_PACKING_FRACTION
@@ -84,8 +83,8 @@ class JacobiDiagonal(jg.Jacobi):
     dense flows.
     """
 
-    def bound(self, contacts, grains):
-        return diagonal(contacts, grains)
+    def bound(self, operator):
+        return operator.diagonal()
 
 
 METHODS: dict[str, dict[str, Any]] = {  # of contact dynamics

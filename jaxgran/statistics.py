@@ -8,22 +8,16 @@ blocks are independent, and underestimates errors when few merged blocks are.
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
+import scipy  # its parts are loaded when they are used
 
-BLOCK_MERGES = (
-    1,
-    2,
-    4,
-    8,
-    16,
-    32,
-)  # blocks per group; with 32 blocks per seed, the last compares whole seeds
-_FEWEST_GROUPS = (
-    4  # the spread over fewer groups is too uncertain; single blocks are used in any case
-)
+# Blocks per group; with 32 blocks per seed, the last compares whole seeds
+BLOCK_MERGES = (1, 2, 4, 8, 16, 32)
+# The spread over fewer groups is too uncertain; single blocks are used in any case
+_FEWEST_GROUPS = 4
 _MOST_BLOCKS = 32  # per seed in ``standard_errors``; more are merged
 _TIMES = np.geomspace(0.2, 100, 16)  # correlation times, in blocks
 _WHITE_SHARES = np.array([0.0, 0.5, 0.9])  # share of white noise in the variance of a block
@@ -33,22 +27,7 @@ _LEVEL = 0.95  # of an interval of 1.96 standard errors
 _NORMAL_QUANTILE = 1.959964
 _NEWTON_STEPS = 4
 _ROUNDING = 64 * np.finfo(float).eps  # of an estimate, to a scatter of the blocks that is none
-_MOST_FREEDOM = 2000  # degrees of freedom beyond which Student's distribution counts as Gaussian
 Estimates = dict[str, np.ndarray]
-
-
-class _Posterior(NamedTuple):
-    """Posterior of n means: a mixture of Student's t distributions, one for each of the (models,)
-    of the correlation.
-
-    ``weight``, ``shift`` (mean of a model minus the plain mean) and ``width`` (its scale) have
-    shape (models, n).
-    """
-
-    weight: np.ndarray
-    shift: np.ndarray
-    width: np.ndarray
-    freedom: int
 
 
 def standard_errors(
@@ -84,7 +63,7 @@ def standard_errors(
     How often intervals for sheared flows hold is measured by ``python -m benchmarks coverage``.
 
     Args:
-      estimate: maps a pytree of sums with any leading axes to by_name estimates with the same
+      estimate: maps a pytree of sums with any leading axes to estimates by name with the same
         leading axes.
       sums: pytree of arrays of shape (seeds, blocks, ...), in any units.
       lengths: (seeds,) durations in any unit; None where all are equal.
@@ -109,7 +88,7 @@ def standard_errors(
     expected = None
     if lengths is not None and correlation is not None and np.max(lengths) > 0:
         expected = correlation / 2 * max(map(len, influence)) / np.max(lengths)
-    half = _half_width(_posterior(influence, expected))
+    half = _half_width(*_posterior(influence, expected), sum(map(len, influence)) - 1)
     return by_name(whole), by_name(scale * half / _NORMAL_QUANTILE)
 
 
@@ -141,7 +120,7 @@ def jackknife(
     Flyvbjerg and Petersen, J. Chem. Phys. 91, 461, 1989).
 
     Args:
-      estimate: maps a pytree of sums with any leading axes to by_name estimates with the same
+      estimate: maps a pytree of sums with any leading axes to estimates by name with the same
         leading axes.
       sums: pytree of arrays of shape (seeds, blocks, ...), in any units.
 
@@ -162,11 +141,9 @@ def jackknife(
     merges = [m for m in BLOCK_MERGES if seeds * (blocks // m) >= (2 if m == 1 else _FEWEST_GROUPS)]
     edges = np.cumsum([1, *(seeds * (blocks // m) for m in merges)])
     flat, by_name = _flat(estimate(jax.tree.map(lambda x: _whole_and_parts(x, merges), sums)))
-    spreads = [
-        np.full_like(flat[0], np.nan),
-        *(_spread(part) for part in np.split(flat, edges)[1:-1]),
-    ]
-    return by_name(flat[0]), by_name(np.fmax.reduce(spreads))
+    spreads = [_spread(part) for part in np.split(flat, edges)[1:-1]]
+    unknown = np.full_like(flat[0], np.nan)
+    return by_name(flat[0]), by_name(np.fmax.reduce([unknown, *spreads]))
 
 
 def correlation_length(
@@ -210,9 +187,8 @@ def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, fl
     lagged = np.sum(residuals[:, 1:] * residuals[:, :-1]) / max(squares, np.finfo(float).tiny)
     correlation = np.clip(lagged, least_correlation, 0.9)
     variance = squares / (2 * half - 2) * 2 / half
-    return float(means[1] - means[0]), float(
-        np.sqrt(variance * (1 + correlation) / (1 - correlation))
-    )
+    error = np.sqrt(variance * (1 + correlation) / (1 - correlation))
+    return float(means[1] - means[0]), float(error)
 
 
 def _influences(
@@ -228,11 +204,13 @@ def _influences(
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
     counts = merged_blocks(lengths, seeds, min(blocks, _MOST_BLOCKS))
     total = int(counts.sum())
-    parts = jax.tree.map(lambda x: _joined(x, counts), sums)
-    rows = [lambda x: x.sum(axis=0)[None], *([_all_but_one] if total > 1 else [])]
-    flat, by_name = _flat(
-        estimate(jax.tree.map(lambda x: np.concatenate([row(x) for row in rows]), parts))
-    )
+
+    def whole_and_parts(x: np.ndarray) -> np.ndarray:
+        parts = _joined(x, counts)
+        whole = parts.sum(axis=0)[None]
+        return np.concatenate([whole, _all_but_one(parts)]) if total > 1 else whole
+
+    flat, by_name = _flat(estimate(jax.tree.map(whole_and_parts, sums)))
     without = flat[1:].astype(float) if total > 1 else np.full(flat.shape, np.nan)
     influence = (total - 1) * (without.mean(axis=0) - without)
     scale = np.sqrt(np.mean(influence**2, axis=0))
@@ -266,101 +244,73 @@ def _prior(expected: float | None) -> np.ndarray:
     correlation time is in blocks.
     """
     if expected is None:
-        of_times = np.log(_TIMES**0.25 / (1 + (_TIMES / _EXPECTED_TIME) ** 2))
+        log_prior = np.log(_TIMES**0.25 / (1 + (_TIMES / _EXPECTED_TIME) ** 2))
     else:
         centre = np.clip(_LONGER * expected, 1, _TIMES[-1])
-        of_times = -(np.log(_TIMES / centre) ** 2) / 2
-    return np.repeat(of_times, len(_WHITE_SHARES))
+        log_prior = -(np.log(_TIMES / centre) ** 2) / 2
+    return np.repeat(log_prior, len(_WHITE_SHARES))
 
 
-def _posterior(seeds: Sequence[np.ndarray], expected: float | None = None) -> _Posterior:
+def _posterior(
+    seeds: Sequence[np.ndarray], expected: float | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Posterior of n means from series (blocks, n) of plain mean zero, one a seed; see
     ``standard_errors``.
+
+    Returns:
+      Weight of each model of the correlation, mean in it less the plain mean, and scale of its
+      Student's t distribution, (models, n) each.
     """
-    count = seeds[0].shape[1]
-    freedom = sum(map(len, seeds)) - 1
-    information = weighted = square = determinant = np.zeros(1)
-    prior = _prior(expected)
-    for blocks in sorted({len(seed) for seed in seeds}):
-        series = np.stack([seed for seed in seeds if len(seed) == blocks])
-        vectors, eigenvalues = _correlation_models(blocks)
-        models, number = len(prior), len(series)
-        flat = series.transpose(1, 0, 2).reshape(blocks, -1)
-        modes = vectors.swapaxes(1, 2) @ flat  # (times, modes, seeds * n)
+    prior = _prior(expected)[:, None]
+    shape, freedom = (len(prior), seeds[0].shape[1]), sum(map(len, seeds)) - 1
+    information = determinant = np.zeros((len(prior), 1))
+    weighted = square = np.zeros(shape)
+    for series in seeds:
+        vectors, eigenvalues = _correlation_models(len(series))
+        modes = vectors.swapaxes(1, 2) @ series  # (times, modes, n)
         ones = vectors.sum(axis=1)[:, None]
-        squares = (modes**2).reshape(len(modes), blocks, number, count).sum(axis=2)
-        sums = modes.reshape(len(modes), blocks, number, count).sum(axis=2)
-        information = information + number * (ones**2 / eigenvalues).sum(axis=2).reshape(
-            models, 1
-        )  # 1'R⁻¹1
-        weighted = weighted + ((ones / eigenvalues) @ sums).reshape(models, count)  # 1'R⁻¹x
-        square = square + ((1 / eigenvalues) @ squares).reshape(models, count)  # x'R⁻¹x
-        determinant = determinant + number * np.log(eigenvalues).sum(axis=2).reshape(models, 1)
+        information = information + (ones**2 / eigenvalues).sum(axis=2).reshape(-1, 1)  # 1'R⁻¹1
+        weighted = weighted + ((ones / eigenvalues) @ modes).reshape(shape)  # 1'R⁻¹x
+        square = square + ((1 / eigenvalues) @ modes**2).reshape(shape)  # x'R⁻¹x
+        determinant = determinant + np.log(eigenvalues).sum(axis=2).reshape(-1, 1)
     shift = weighted / information
     residual = np.maximum(square - weighted * shift, np.finfo(float).tiny)
-    log_weight = (
-        prior[:, None] - (determinant + np.log(information) + freedom * np.log(residual)) / 2
-    )
+    log_weight = prior - (determinant + np.log(information) + freedom * np.log(residual)) / 2
     weight = np.exp(log_weight - log_weight.max(axis=0))
-    return _Posterior(
-        weight / weight.sum(axis=0), shift, np.sqrt(residual / (freedom * information)), freedom
-    )
+    width = np.sqrt(residual / (freedom * information))
+    return weight / weight.sum(axis=0), shift, width
 
 
-def _half_width(posterior: _Posterior) -> np.ndarray:
-    """Half-width (n,) of the interval around zero that contains a mean with probability ``_LEVEL``.
-
-    Newton's method, with Student's distribution interpolated from a table over z/√(ν + z²), since
-    it is evaluated 300 times for each mean.
+def _half_width(
+    weight: np.ndarray, shift: np.ndarray, width: np.ndarray, freedom: int
+) -> np.ndarray:
+    """Half-width (n,) of the interval around zero that contains a mean with probability
+    ``_LEVEL``, by Newton's method, from the mixture of ``_posterior``.
     """
-    weight, shift, width, freedom = posterior
-    freedom = min(freedom, _MOST_FREEDOM)
-    places, probability, density, quantile = _student(freedom)
+    special: Any = scipy.special
+    quantile = special.stdtrit(freedom, (1 + _LEVEL) / 2)
+    highest = 1 / (np.sqrt(freedom) * special.beta(freedom / 2, 0.5))  # density at zero
     half = np.sqrt(np.sum(weight * ((quantile * width) ** 2 + shift**2), axis=0))
     for _ in range(_NEWTON_STEPS):
         z = np.stack([half - shift, half + shift]) / width
-        place = z / np.hypot(
-            np.sqrt(freedom), z
-        )  # z of a constant series is so large that its square overflows
-        excess = np.sum(weight * np.interp(place, places, probability), axis=(0, 1)) - 1 - _LEVEL
-        slope = np.sum(weight / width * np.interp(place, places, density), axis=(0, 1))
+        # z of a constant series is so large that its square overflows
+        density = highest * np.hypot(1, z / np.sqrt(freedom)) ** -(freedom + 1.0)
+        excess = np.sum(weight * special.stdtr(freedom, z), axis=(0, 1)) - 1 - _LEVEL
+        slope = np.sum(weight / width * density, axis=(0, 1))
         half = np.clip(half - excess / slope, half / 2, 2 * half)
     return half
 
 
-@lru_cache(maxsize=32)
-def _student(freedom: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Points u = z/√(ν + z²), distribution and density of Student's t there, and its quantile of
-    the interval.
-
-    With u = sin φ the density of φ is proportional to cos^(ν - 1) φ.
-    """
-    angles = np.linspace(-np.pi / 2, np.pi / 2, 4001)
-    cosines = np.maximum(np.cos(angles), 0)
-    powers = cosines ** (freedom - 1)
-    probability = np.concatenate([[0], np.cumsum(powers[1:] + powers[:-1]) / 2])
-    factor = 1 / (probability[-1] * (angles[1] - angles[0]) * np.sqrt(freedom))
-    probability /= probability[-1]
-    quantile = np.sqrt(freedom) * np.tan(np.interp((1 + _LEVEL) / 2, probability, angles))
-    return np.sin(angles), probability, factor * cosines ** (freedom + 1), float(quantile)
-
-
-def _merged(x: np.ndarray, merge: int) -> np.ndarray:
-    """Sums over groups of ``merge`` successive blocks, (seeds · groups, ...); no group spans two
-    seeds.
+def _whole_and_parts(x: np.ndarray, merges: list[int]) -> np.ndarray:
+    """The sum over all blocks, then for each merge the leave-one-out sums of the whole groups, (1 +
+    groups + groups + ..., ...).
     """
     seeds, blocks = x.shape[:2]
-    groups = blocks // merge
-    return x[:, : groups * merge].reshape(seeds * groups, merge, *x.shape[2:]).sum(axis=1)
-
-
-def _whole_and_parts(x: np.ndarray, merges: list[int]) -> np.ndarray:
-    """The sum over all blocks, then for each merge the leave-one-out sums, (1 + groups + groups +
-    ..., ...).
-    """
-    return np.concatenate(
-        [x.sum(axis=(0, 1))[None], *(_all_but_one(_merged(x, m)) for m in merges)]
-    )
+    counts = [(merge, blocks // merge) for merge in merges]
+    grouped = [
+        x[:, : n * merge].reshape(seeds * n, merge, *x.shape[2:]).sum(axis=1) for merge, n in counts
+    ]
+    return np.concatenate([x.sum(axis=(0, 1))[None], *map(_all_but_one, grouped)])
 
 
 def _all_but_one(groups: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxgran.contact.delassus import NetworkOperator
 from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics.advance import advance
@@ -229,11 +230,10 @@ def scene():
 @pytest.fixture(scope="session")
 def solved():
     """``solved(network, tolerance, max_steps, method, active)``: the contact solve, compiled."""
-    compiled = jax.jit(solve, static_argnums=1)
+    compiled = jax.jit(solve)
 
     def call(network, tolerance=1e-12, max_steps=100_000, method=BarzilaiBorwein, active=True):
-        return compiled(
-            network, 60, jnp.asarray(1.0), method(tolerance, max_steps), jnp.asarray(active)
-        )
+        operator, solver = NetworkOperator(network, 60), method(tolerance, max_steps)
+        return compiled(operator, jnp.asarray(1.0), solver, jnp.asarray(active))
 
     return call

@@ -37,7 +37,7 @@ from synthetic import one_sentence, refused, snapshot_of
 
 import jaxgran as jg
 from jaxgran.analysis import fields
-from jaxgran.contact.solve_contacts import contact_residuals
+from jaxgran.contact.solve_contacts import contact_residual
 from jaxgran.dynamics import snapshots
 from jaxgran.io.trajectory import check_trajectory
 from jaxgran.maps import automatic, settings_checks
@@ -218,7 +218,7 @@ def test_lists_of_numbers_stand_for_arrays() -> None:
     row = jg.DelassusProblem([[2, -1.0], [-1, 2]], [-1, 0])
     assert jg.solve_contacts(row, 1.0).impulses.tolist() == pytest.approx([4 / 3, 2 / 3], rel=1e-3)
     pair = jg.ContactNetwork([[0, 1]], [[1.0, 0.0]], [1, 1], [-1])
-    assert contact_residuals(pair, [0.5]).natural_map == 0
+    assert contact_residual(pair, [0.5]) == 0
     with pytest.raises(WouldRun):
         jg.fields_at(SEEN, [[1.0, 2.0]], 0.25)
 
@@ -357,7 +357,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "one grain twice": lambda: solving(PAIR, ends=np.ones((1, 2), int)),
     "unit vectors": lambda: solving(PAIR, normals=2 * np.ones((1, 2))),
     "solver must be a ProjectedMethod": lambda: jg.solve_contacts(EVEN, solver=jg.Nesterov),
-    "impulses must be an array (2,)": lambda: contact_residuals(EVEN, np.zeros(1)),
+    "impulses must be an array (2,)": lambda: contact_residual(EVEN, np.zeros(1)),
     # maps
     "must be a list without repetition, in any": lambda: make_map("restitution", (0.5, 0.9, 0.5)),
     "restitution must be a list of numbers": lambda: make_map(

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from jax import lax
 from oracles import MAX_DISCS, build, delassus, padded_network, random_network
 
-from jaxgran.contact.delassus import grain_impulses
+from jaxgran.contact.delassus import NetworkOperator, grain_impulses
 from jaxgran.contact.near_pairs import Frame, present, separations_now
 from jaxgran.contact.network import Contacts, pair_motion
 from jaxgran.contact.projected_methods import BarzilaiBorwein, Nesterov
@@ -48,9 +48,8 @@ def impulses_of(approach, angles, inverse_masses, network: Contacts):
         inverse_mass_i=jnp.where(network.used, inverse_masses[network.i], 0),
         inverse_mass_j=jnp.where(network.used, inverse_masses[network.j], 0),
     )
-    return solve(
-        turned, MAX_DISCS, jnp.asarray(1.0), BarzilaiBorwein(1e-12, 100_000), jnp.asarray(True)
-    ).impulses
+    operator, solver = NetworkOperator(turned, MAX_DISCS), BarzilaiBorwein(1e-12, 100_000)
+    return solve(operator, jnp.asarray(1.0), solver, jnp.asarray(True)).impulses
 
 
 @jax.jit
@@ -140,7 +139,8 @@ def test_velocities_are_differentiable_where_impulses_are_not_unique():
         approach = jnp.sum(empty.normals * (velocities[empty.i] - velocities[empty.j]), axis=-1)
         network = replace(empty, approach=jnp.where(empty.used, approach, 0))
         solver = Nesterov(1e-12, 1_000_000)
-        impulses = solve(network, MAX_DISCS, jnp.asarray(1.0), solver, jnp.asarray(True)).impulses
+        operator = NetworkOperator(network, MAX_DISCS)
+        impulses = solve(operator, jnp.asarray(1.0), solver, jnp.asarray(True)).impulses
         return velocities + grain_impulses(network, impulses, MAX_DISCS)
 
     inwards = np.zeros((MAX_DISCS, 2))

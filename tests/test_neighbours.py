@@ -8,7 +8,7 @@ import pytest
 from jax import lax
 from scipy.spatial import cKDTree
 
-from jaxgran.contact.cell_list import _cells_per_side, cell_list_pairs, set_bit
+from jaxgran.contact.cell_list import _cells_per_side, cell_list_pairs
 from jaxgran.model.cell import wrap
 
 TILTS = (-0.5, -0.2, 0.0, 0.31, 0.499)
@@ -164,13 +164,3 @@ def test_whatever_may_be_missing_is_flagged():
     assert search(positions * 0.3, side, tilt, cutoff, capacity)[-1], (
         "more pairs than the list holds"
     )
-
-
-def test_set_bit_is_the_place_of_the_bit_of_that_rank():
-    words = np.random.default_rng(0).integers(0, 2**32, 50, dtype=np.uint32)
-    words[:3] = 1, 2**31, 2**32 - 1
-    ranks = np.tile(np.arange(32, dtype=np.int32), len(words))
-    rows = jax.jit(set_bit)(np.repeat(words, 32), ranks).reshape(-1, 32)
-    for word, row in zip(words, rows, strict=True):
-        places = [k for k in range(32) if int(word) >> k & 1]
-        assert row[: len(places)].tolist() == places

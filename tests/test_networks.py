@@ -14,12 +14,12 @@ from benchmarks import networks as module
 from benchmarks.exact_contacts import exact, incidence
 from benchmarks.gauss_seidel import gauss_seidel
 from benchmarks.networks import CHAINS, INFEASIBLE, chain, collection
-from jaxgran.contact.delassus import spectral_bound
+from jaxgran.contact.delassus import NetworkOperator
 from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi, Nesterov
 from jaxgran.contact.solver import solve
 from jaxgran.model.status import Status
 
-compiled_bound = jax.jit(spectral_bound, static_argnums=1)
+compiled_bound = jax.jit(NetworkOperator.spectral_bound)
 
 
 @pytest.fixture(scope="module")
@@ -44,13 +44,12 @@ def feasible(networks):
 @pytest.fixture(scope="module")
 def solution_of():
     """``solution_of(network, tolerance, max_steps, method)``: the contact solve, compiled."""
-    compiled = jax.jit(solve, static_argnums=1)
+    compiled = jax.jit(solve)
 
     def call(network, tolerance=1e-4, max_steps=5000, method=BarzilaiBorwein):
+        operator = NetworkOperator(network.contacts, network.grains)
         solver = method(tolerance, max_steps)
-        return compiled(
-            network.contacts, network.grains, jnp.asarray(1.0), solver, jnp.asarray(True)
-        )
+        return compiled(operator, jnp.asarray(1.0), solver, jnp.asarray(True))
 
     return call
 
@@ -100,7 +99,7 @@ def test_jacobi_with_the_spectral_bound_lowers_the_objective_in_every_step(feasi
     for number, network in enumerate(feasible):
         used = np.asarray(network.contacts.used)
         matrix, approach = operator_and_approach(network)
-        bound = np.asarray(compiled_bound(network.contacts, network.grains))[used]
+        bound = np.asarray(compiled_bound(NetworkOperator(network.contacts, network.grains)))[used]
         impulses, objectives, residuals, iterates = np.zeros(len(approach)), [0.0], [], []
         for _ in range(30):
             impulses = np.maximum(0, impulses - 1.99 * (matrix @ impulses + approach) / bound)

@@ -29,6 +29,19 @@ def test_import_is_light() -> None:
     )
 
 
+def test_jax_md_is_imported_where_cells_are_searched_only() -> None:
+    code = """
+import sys, jax, jaxgran as jg
+for grains in (256, 600):
+    flow = jg.ShearFlow(grains=grains, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
+    def sample(key):
+        return jg.sample(flow, jg.pack(flow, key)[0], strain=1.0, engine=jg.Jax())
+    jax.eval_shape(sample, jax.random.key(0))
+    print("jax_md" in sys.modules)
+"""
+    assert run_python(code) == "False\nTrue\n"
+
+
 def test_import_starts_no_backend_and_changes_no_flag_of_jax() -> None:
     code = """
 import jax

@@ -8,8 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from oracles import build, listed_pairs, move, pairs_within
 
 from jaxgran.contact import near_pairs
@@ -17,7 +15,6 @@ from jaxgran.contact.near_pairs import (
     Frame,
     PairLists,
     consumed_skin,
-    first_true,
     pair_lists,
     present,
     refresh,
@@ -27,21 +24,6 @@ from jaxgran.model.cell import displacement
 from jaxgran.model.grains import Grains
 
 EPS = np.finfo(float).eps
-
-
-compiled_first = jax.jit(first_true, static_argnums=1)
-
-
-@pytest.mark.parametrize(
-    ("length", "size"), [(1, 3), (31, 8), (32, 40), (33, 5), (496, 96), (5000, 64)]
-)
-@settings(max_examples=25)
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.01, 0.1, 0.5, 0.99, 1.0]))
-def test_first_true_entries(length, size, seed, density):
-    mask = np.random.default_rng(seed).random(length) < density
-    expected = np.nonzero(mask)[0][:size]
-    expected = np.concatenate([expected, np.full(size - len(expected), length)])
-    np.testing.assert_array_equal(compiled_first(mask, size), expected)
 
 
 @jax.jit

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from oracles import MAX_DISCS, delassus, exact_velocities, padded_network, random_network
 from synthetic import refused
 
-from jaxgran.contact.delassus import delassus_product, grain_impulses, spectral_bound
+from jaxgran.contact.delassus import NetworkOperator, grain_impulses
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi, Nesterov, ProjectedMethod
 from jaxgran.contact.solver import solve
@@ -23,8 +23,8 @@ EPS = np.finfo(float).eps
 METHODS = [Nesterov, BarzilaiBorwein, Jacobi]
 networks = st.tuples(st.integers(0, 2**32 - 1), st.integers(1, MAX_DISCS))
 
-compiled_bound = jax.jit(spectral_bound, static_argnums=1)
-compiled_product = jax.jit(delassus_product, static_argnums=2)
+compiled_bound = jax.jit(NetworkOperator.spectral_bound)
+compiled_product = jax.jit(NetworkOperator.product)
 compiled_impulses = jax.jit(grain_impulses, static_argnums=2)
 
 
@@ -40,7 +40,7 @@ def velocities_after(
 @given(networks, st.sampled_from([1.0, 100.0, 1e6]))
 def test_delassus_operator_never_exceeds_its_bound(network_of, heaviest):
     network, masses, _ = random_network(*network_of, heaviest)
-    scale = 1 / np.sqrt(np.asarray(compiled_bound(network, MAX_DISCS)))
+    scale = 1 / np.sqrt(np.asarray(compiled_bound(NetworkOperator(network, MAX_DISCS))))
     largest = np.linalg.eigvalsh(delassus(network, masses) * scale[:, None] * scale[None, :])[-1]
     assert largest <= 1 + MAX_DISCS * EPS
 
@@ -54,9 +54,9 @@ def test_delassus_product_equals_the_dense_matrix(network_of):
     )  # unused slots too: they are inert
     matrix = delassus(network, masses)
     rounding = 16 * EPS * (np.abs(matrix) @ np.abs(impulses))
+    operator = NetworkOperator(network, MAX_DISCS)
     assert np.all(
-        np.abs(compiled_product(network, jnp.asarray(impulses), MAX_DISCS) - matrix @ impulses)
-        <= rounding
+        np.abs(compiled_product(operator, jnp.asarray(impulses)) - matrix @ impulses) <= rounding
     )
 
 
@@ -195,8 +195,7 @@ def test_compiled_solve_equals_the_interpreted_one(solved):
     compiled = solved(network, 1e-4, 8)
     with jax.disable_jit():
         interpreted = solve(
-            network,
-            MAX_DISCS,
+            NetworkOperator(network, MAX_DISCS),
             jnp.asarray(1.0),
             BarzilaiBorwein(1e-4, 8),
             jnp.asarray(True),

@@ -114,8 +114,17 @@ def solved(problem: Problem, guess: np.ndarray) -> Solved:
 def certificate(
     problem: Problem, impulses: np.ndarray, impulses_low: np.ndarray
 ) -> dict[str, float]:
-    """How far impulses are from a solution, in fixed point; the names and units are those of
-    ``ContactResiduals``.
+    """How far impulses are from a solution, in fixed point; all are zero at one.
+
+    ===============  ===============================================================
+    natural_map      ‖min(W_cc J, w)‖ / v
+    complementarity  largest |J w| of a contact / E
+    energy           |J·w| / E
+    approach         largest speed −w at which a contact still approaches / v
+    tension          largest speed −W_cc J of an impulse that pulls / v
+    ===============  ===============================================================
+
+    v = ‖min(u⁻, 0)‖ and E = Σ min(u⁻, 0)²/W_cc are what stops every contact by itself.
     """
     impulses_fixed = fixed(impulses) + fixed(impulses_low)
     after_fixed = _Exact(problem).after(impulses_fixed)

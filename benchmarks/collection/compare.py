@@ -24,8 +24,7 @@ from benchmarks.collection.files import Entry
 from benchmarks.collection.make import padded
 from benchmarks.gauss_seidel import gauss_seidel
 from benchmarks.timing import timed
-from jaxgran.contact.problem import as_contacts
-from jaxgran.contact.solve_contacts import ContactSolution, contact_residuals
+from jaxgran.contact.solve_contacts import ContactSolution, contact_residual
 from jaxgran.model.status import Status
 
 CAP = 20_000  # products with W of our own methods
@@ -109,7 +108,7 @@ def residual_of(entry: Entry, impulses: np.ndarray) -> float:
     network = padded(entry.problem)
     filled = np.zeros(len(network.approach))
     filled[: len(entry.problem.approach)] = impulses
-    return float(contact_residuals(network, jnp.asarray(filled)).natural_map)
+    return float(contact_residual(network, jnp.asarray(filled)))
 
 
 def projected(method: jg.ProjectedMethod, entry: Entry, tolerance: float) -> Solve:
@@ -137,8 +136,8 @@ def solved_network(network: jg.ContactNetwork, solver: jg.ProjectedMethod) -> Co
 
 def swept(entry: Entry, tolerance: float) -> Solve:
     """Gauss–Seidel sweeps, a loop in numba."""
-    contacts = as_contacts(jg.ContactNetwork(*map(jnp.asarray, entry.problem)))
-    contacts = jax.tree.map(np.asarray, contacts)
+    network = jg.ContactNetwork(*map(jnp.asarray, entry.problem))
+    contacts = jax.tree.map(np.asarray, network.operator().contacts)
 
     def solve() -> Answer:
         solution = gauss_seidel(contacts, len(entry.problem.masses), tolerance, CAP)

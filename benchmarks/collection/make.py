@@ -21,8 +21,6 @@ from benchmarks.collection.files import Entry, write
 from benchmarks.collection.problems import Made, problems
 from benchmarks.networks import SLOTS
 from benchmarks.output import Output
-from jaxgran.contact.delassus import spectral_bound
-from jaxgran.contact.problem import as_contacts
 
 UNIQUE, WORST = (
     1e-20,
@@ -79,9 +77,7 @@ def proved(problem: Problem) -> Solved:
 
 
 _guess = jax.jit(jg.solve_contacts)
-_bound_of_grains = jax.jit(
-    lambda network: spectral_bound(as_contacts(network), network.masses.size)
-)
+_bound_of_grains = jax.jit(lambda network: network.operator().spectral_bound())
 
 
 def padded(problem: Problem) -> jg.ContactNetwork:

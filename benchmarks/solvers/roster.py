@@ -37,9 +37,11 @@ class JacobiCount(jg.Jacobi):
     Source: R. Tonge, F. Benevolenski and A. Voroshilov, ACM Trans. Graph. 31, 105 (2012).
     """
 
-    def bound(self, contacts, grains):
+    def bound(self, operator):
+        contacts = operator.contacts
         used = contacts.used.astype(contacts.normals.dtype)
-        count = jnp.zeros(grains, used.dtype).at[contacts.i].add(used).at[contacts.j].add(used)
+        count = jnp.zeros(operator.grains, used.dtype)
+        count = count.at[contacts.i].add(used).at[contacts.j].add(used)
         bound = (
             count[contacts.i] * contacts.inverse_mass_i
             + count[contacts.j] * contacts.inverse_mass_j

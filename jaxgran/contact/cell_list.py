@@ -21,19 +21,16 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxgran.contact.compaction import WORD, count_bits, locate_bits, pack_bits
 from jaxgran.model.control_flow import any_replica, where_active
 
-_WORD = 32
-_CELL_CAPACITIES = (
-    _WORD,
-    4 * _WORD,
-)  # about 10 grains are expected in a cell; the second for dense clusters
+# About 10 grains are expected in a cell; the second is for dense clusters
+_CELL_CAPACITIES = (WORD, 4 * WORD)
 _MARGIN = 1.2  # of the number of pairs that the grid is made for, over the capacity
 _ROOM = 2  # candidates returned, over the capacity
 _LARGEST_TILT = 0.5
-_HALF_STENCIL = np.array(
-    [[0, 0], [1, 0], [-1, 1], [0, 1], [1, 1]], np.int32
-)  # the cell itself comes first
+# The cell itself comes first
+_HALF_STENCIL = np.array([[0, 0], [1, 0], [-1, 1], [0, 1], [1, 1]], np.int32)
 
 
 def cell_list_pairs(
@@ -43,7 +40,7 @@ def cell_list_pairs(
 
     The grid is static: it serves a cutoff within which a homogeneous flow has up to 1.2 ×
     ``capacity`` pairs, and any smaller one. Up to 2 × ``capacity`` pairs are found, with up to 128
-    grains in a cell; beyond that ``missed`` is set.
+    grains in a cell; beyond that pairs may be missing.
 
     Args:
       positions: (grains, 2), centres in σ.
@@ -55,28 +52,26 @@ def cell_list_pairs(
       Grains i < j of each pair (2·capacity,), with i = j in an empty slot; and whether pairs may be
       missing, since the cutoff is too large for the grid, or a cell or the list of pairs is full.
     """
-    positions, side, tilt, cutoff = lax.stop_gradient(
-        (positions, side, tilt, cutoff)
-    )  # pairs are whole numbers
+    # pairs are whole numbers
+    positions, side, tilt, cutoff = lax.stop_gradient((positions, side, tilt, cutoff))
     cells = _cells_per_side(positions.shape[0], capacity)
-    fractional = (
-        jnp.stack([positions[:, 0] - tilt * positions[:, 1], positions[:, 1]], axis=-1) / side
-    )
-    fractional = fractional - jnp.floor(fractional)
+    x, y = positions[:, 0], positions[:, 1]
+    scaled = jnp.stack([x - tilt * y, y], axis=-1) / side
+    fractional = scaled - jnp.floor(scaled)
     reach = cutoff / side + 8 * jnp.finfo(positions.dtype).eps  # the coordinates are rounded
     cells_suffice = reach * jnp.sqrt(1 + tilt**2) <= 1 / cells
 
     def search(cell_capacity: int):
         return _search(fractional, tilt, reach, cells, cell_capacity, _ROOM * capacity)
 
-    few = search(_CELL_CAPACITIES[0])
-    crowded = few[-1]
-    i, j, overfull, crowded = lax.cond(
+    first = search(_CELL_CAPACITIES[0])
+    crowded = first[-1]
+    i, j, too_many_pairs, too_crowded = lax.cond(
         any_replica(crowded),
-        lambda: where_active(crowded, search(_CELL_CAPACITIES[1]), few),
-        lambda: few,
+        lambda: where_active(crowded, search(_CELL_CAPACITIES[1]), first),
+        lambda: first,
     )
-    return i, j, overfull | crowded | ~cells_suffice
+    return i, j, too_many_pairs | too_crowded | ~cells_suffice
 
 
 def largest_cutoff(count: int, side: Array, capacity: int) -> Float[Array, ""]:
@@ -99,48 +94,29 @@ def _search(
     """Pairs (i, j), whether there are more than ``size``, and whether a cell holds more than its
     capacity.
     """
-    count, words = fractional.shape[0], cell_capacity // _WORD
+    count, words = fractional.shape[0], cell_capacity // WORD
     cells = _cell_list(fractional, cells_per_side, cell_capacity)
-    members = cells.id_buffer.reshape(-1, words, _WORD)
-    x, y = (cells.position_buffer.reshape(-1, words, _WORD, 2)[..., axis] for axis in (0, 1))
-    near = (cells.particle_cell_id[:, None, :] + _HALF_STENCIL[None]) % cells_per_side
-    near = near[..., 0] + near[..., 1] * cells_per_side  # (grains, stencil)
-
-    grain = jnp.arange(count, dtype=jnp.int32)[:, None, None, None]
-    dx = x[near] - fractional[:, 0, None, None, None]
-    dy = y[near] - fractional[:, 1, None, None, None]
-    dx, dy = dx - jnp.round(dx), dy - jnp.round(dy)
-    other = members[near]  # (grains, stencil, words, 32)
-    once = (other > grain) | (np.arange(len(_HALF_STENCIL)) > 0)[None, :, None, None]
-    pair = ((dx + tilt * dy) ** 2 + dy**2 <= reach**2) & (other < count) & once
-    bits = jnp.where(
-        pair, jnp.uint32(1) << np.arange(_WORD, dtype=np.uint32)[None, None, None], jnp.uint32(0)
+    members = cells.id_buffer.reshape(-1, cell_capacity)
+    x, y = (cells.position_buffer.reshape(-1, cell_capacity, 2)[..., axis] for axis in (0, 1))
+    columns, rows = jnp.moveaxis(
+        (cells.particle_cell_id[:, None, :] + _HALF_STENCIL[None]) % cells_per_side, -1, 0
     )
-    bits = jnp.sum(bits, axis=-1, dtype=jnp.uint32).reshape(-1)
+    near = columns + rows * cells_per_side  # (grains, stencil)
 
-    counts = lax.population_count(bits).astype(jnp.int32)
-    ends = jnp.cumsum(counts, dtype=jnp.int32)
-    starts = ends - counts
-    index = jnp.arange(bits.size, dtype=jnp.int32)
-    word = lax.cummax(
-        jnp.zeros(size, jnp.int32).at[starts].max(index, mode="drop")
-    )  # the word of each pair
-    slot = jnp.arange(size, dtype=jnp.int32)
-    place = set_bit(bits[word], slot - starts[word])
-    i = word // (len(_HALF_STENCIL) * words)
-    j = members[near.reshape(-1)[word // words], word % words, place]
-    filled = slot < ends[-1]
-    i, j = jnp.where(filled, i, 0), jnp.where(filled, j, 0)
-    return jnp.minimum(i, j), jnp.maximum(i, j), ends[-1] > size, cells.did_buffer_overflow
+    grain = jnp.arange(count, dtype=jnp.int32)[:, None, None]
+    dx, dy = x[near] - fractional[:, 0, None, None], y[near] - fractional[:, 1, None, None]
+    dx, dy = dx - jnp.round(dx), dy - jnp.round(dy)
+    other = members[near]  # (grains, stencil, capacity)
+    once = (other > grain) | (np.arange(len(_HALF_STENCIL)) > 0)[None, :, None]
+    is_pair = ((dx + tilt * dy) ** 2 + dy**2 <= reach**2) & (other < count) & once
 
-
-def set_bit(bits: Array, rank: Array) -> Array:
-    """Place of the set bit of the given rank (from 0) in words of 32 bits: that of the first with
-    more set bits.
-    """
-    up_to = np.uint32(2) * (np.uint32(1) << np.arange(_WORD, dtype=np.uint32)) - np.uint32(1)
-    set_up_to = lax.population_count(bits[:, None] & up_to[None, :]).astype(rank.dtype)
-    return jnp.sum(set_up_to <= rank[:, None], axis=1, dtype=rank.dtype)
+    bits = pack_bits(is_pair.reshape(-1))
+    word, place, is_filled = locate_bits(bits, size)
+    cell, member = near.reshape(-1)[word // words], word % words * WORD + place
+    i = jnp.where(is_filled, word // (len(_HALF_STENCIL) * words), 0)
+    j = jnp.where(is_filled, members[cell, member], 0)
+    overflows = count_bits(bits) > size
+    return jnp.minimum(i, j), jnp.maximum(i, j), overflows, cells.did_buffer_overflow
 
 
 def _cell_list(fractional: Array, cells_per_side: int, cell_capacity: int):

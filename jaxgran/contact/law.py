@@ -13,7 +13,6 @@ along the flight is f(t) = |s + u t|² − d² = |u|² t² + 2 s·u t + |s|² �
 from typing import Any, NamedTuple
 
 from jax.numpy import ceil, maximum, sqrt, where
-from jaxtyping import Array
 
 from jaxgran.model.status import DEEP_OVERLAP
 
@@ -35,25 +34,6 @@ def gap_coefficients(
     return ux * ux + uy * uy, x * ux + y * uy, x * x + y * y - reach * reach
 
 
-def overlaps_within(
-    squared_speed: Array, closing: Array, excess: Array, look_ahead: Number
-) -> tuple:
-    """The activation rule: whether pairs are contacts, and whether they approach.
-
-    The gap falls until the closest approach, so it is read at θ·dt or at the closest approach,
-    whichever comes first. A receding pair is judged at θ·dt.
-
-    Args:
-      squared_speed, closing, excess: |u|², s·u and |s|² − d², see ``gap_coefficients``.
-      look_ahead: θ·dt.
-    """
-    approaching = closing < 0
-    closest = -closing / where(approaching, squared_speed, 1)
-    is_sooner = approaching & (-closing < squared_speed * look_ahead)
-    t = where(is_sooner, closest, look_ahead)
-    return excess + t * (2 * closing + t * squared_speed) <= 0, approaching
-
-
 def gap_discriminant(squared_speed: Number, closing: Number, excess: Number) -> Number:
     """Below zero where the pair never touches."""
     return closing * closing - squared_speed * excess
@@ -71,19 +51,6 @@ def first_step(time: Number, timestep: Number, fraction: Number) -> Number:
     time.
     """
     return ceil(time / timestep - fraction)
-
-
-def time_to_touch(squared_speed: Array, closing: Array, excess: Array) -> tuple:
-    """Time at which free flight makes a pair touch, and time of its closest approach.
-
-    The time is negative for an approaching pair that overlaps already and infinite for a pair that
-    never touches.
-    """
-    discriminant = gap_discriminant(squared_speed, closing, excess)
-    touches = (closing < 0) & (discriminant >= 0)
-    time = touching_time(where(touches, closing, 0), excess, sqrt(where(touches, discriminant, 1)))
-    closest = -closing / where(closing < 0, squared_speed, 1)
-    return where(touches, time, float("inf")), closest
 
 
 def flight_of(cx: Number, cy: Number, strain: Number, flight: Number, shear_rate: Number) -> tuple:

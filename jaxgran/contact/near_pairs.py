@@ -24,11 +24,11 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxgran.contact.cell_list import cell_list_pairs, largest_cutoff, set_bit
+from jaxgran.contact.cell_list import cell_list_pairs, largest_cutoff
+from jaxgran.contact.compaction import bit_positions, count_bits, pack_bits
 from jaxgran.model.cell import displacement, remap_tilt, sheared, wrap
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.grains import Grains
@@ -37,12 +37,9 @@ from jaxgran.model.indexing import taken
 ALL_PAIRS_LIMIT = 512  # above this number of grains the search uses a cell list
 NEAR_PAIRS_PER_GRAIN = 4
 OUTER_PAIRS_PER_GRAIN = 10
-_WORD, _FEW_WORDS = 32, 128
 _FILL = 0.8  # share of a buffer that the expected number of pairs may take
-_NARROWER, _LEAST_SHARE = (
-    0.7,
-    0.15,
-)  # of the skin, where the grains cluster and a buffer is too small
+_NARROWER, _LEAST_SHARE = 0.7, 0.15  # of the skin, where grains cluster and a buffer is too small
+_FAR = 1e6  # σ, separation in an empty slot
 
 
 @jax.tree_util.register_dataclass
@@ -106,12 +103,8 @@ class PairLists:
 
 def separations_now(pairs: PairList, frame: Frame) -> Float[Array, "pairs 2"]:
     """Separations r_i − r_j of the pairs after the motion of the frame."""
-    d = (
-        pairs.separations
-        + taken(frame.displacements, pairs.i)
-        - taken(frame.displacements, pairs.j)
-    )
-    return sheared(d, frame.strain)
+    at_i, at_j = taken(frame.displacements, pairs.i), taken(frame.displacements, pairs.j)
+    return sheared(pairs.separations + at_i - at_j, frame.strain)
 
 
 def consumed_skin(frame: Frame, since: Frame, distance: Array) -> Float[Array, ""]:
@@ -137,12 +130,13 @@ def no_lists(positions: Float[Array, "grains 2"], tilt: Array) -> PairLists:
 
     def empty(pairs_per_grain: int) -> PairList:
         slots, dtype = _capacity(pairs_per_grain, len(positions)), positions.dtype
-        none, far = (
-            jnp.zeros(slots, jnp.int32),
-            jnp.broadcast_to(jnp.asarray([1e6, 0], dtype), (slots, 2)),
-        )
         return PairList(
-            none, none, far, jnp.zeros(slots, dtype), jnp.asarray(-jnp.inf, dtype), jnp.bool_(False)
+            i=jnp.zeros(slots, jnp.int32),
+            j=jnp.zeros(slots, jnp.int32),
+            separations=jnp.broadcast_to(jnp.asarray([_FAR, 0], dtype), (slots, 2)),
+            reach=jnp.zeros(slots, dtype),
+            skin=jnp.asarray(-jnp.inf, dtype),
+            overflow=jnp.bool_(False),
         )
 
     at_rest = Frame(jnp.zeros_like(positions), jnp.zeros_like(tilt))
@@ -184,53 +178,9 @@ def refresh(lists: PairLists, grains: Grains, side: Array, stale: Bool[Array, ""
 
     kept = lists.outer, lists.frame, lists.positions, lists.tilt
     outer, frame, positions, tilt = lax.cond(any_replica(search), searched, lambda: kept)
-    near = _near_pairs(
-        outer, frame, jnp.minimum(nominal, jnp.where(search, outer.skin, remaining)), grains
-    )
+    skin = jnp.minimum(nominal, jnp.where(search, outer.skin, remaining))
+    near = _near_pairs(outer, frame, skin, grains)
     return where_active(stale, PairLists(outer, near, frame, frame, positions, tilt), lists)
-
-
-def first_true(mask: Bool[Array, " m"], size: int) -> Int[Array, " size"]:
-    """Indices of the first ``size`` True entries, padded with the length of the mask.
-
-    Rank and select on words of 32 bits. The word that holds the k-th True entry follows from the
-    running number of set bits, and its place in the word by halving. Inside a step this costs a
-    tenth of ``jnp.nonzero``.
-
-    Examples:
-      >>> first_true(jnp.array([False, True, True, False, True]), 4).tolist()
-      [1, 2, 4, 5]
-    """
-    return set_bits(bit_words(mask), size, mask.size)
-
-
-def bit_words(mask: Bool[Array, " m"]) -> UInt32[Array, " words"]:
-    """The mask in words of 32 bits, the first entry in the lowest bit."""
-    words = -(-mask.size // _WORD)
-    bits = jnp.pad(mask, (0, words * _WORD - mask.size)).reshape(words, _WORD)
-    weights = np.uint32(1) << np.arange(_WORD, dtype=np.uint32)
-    return jnp.sum(jnp.where(bits, weights[None, :], np.uint32(0)), axis=1, dtype=jnp.uint32)
-
-
-def set_bits(words: UInt32[Array, " words"], size: int, length: int) -> Int[Array, " size"]:
-    """Positions of the first ``size`` set bits, padded with ``length``."""
-    count = words.size
-    set_in_word = lax.population_count(words).astype(jnp.int32)
-    wanted = jnp.arange(size, dtype=jnp.int32)
-    if count <= _FEW_WORDS:
-        triangle = np.tri(count, dtype=bool)
-        running = jnp.sum(
-            jnp.where(triangle, set_in_word[None, :], np.int32(0)), axis=1, dtype=jnp.int32
-        )
-        word = jnp.sum(running[None, :] <= wanted[:, None], axis=1, dtype=jnp.int32)
-    else:
-        running = jnp.cumsum(set_in_word, dtype=jnp.int32)
-        word = jnp.searchsorted(running, wanted, side="right", method="scan_unrolled").astype(
-            jnp.int32
-        )
-    within = jnp.minimum(word, count - 1)
-    place = set_bit(taken(words, within), wanted - taken(running - set_in_word, within))
-    return jnp.where(word < count, within * _WORD + place, length)
 
 
 def _nominal_skin(pairs_per_grain: int, grains: Grains, side: Array) -> Float[Array, ""]:
@@ -246,12 +196,11 @@ def widest_skin(grains: Grains, side: Array) -> Float[Array, ""]:
     """The largest skin of lists of these grains: nearest images are unique, and the grid of cells
     is fine enough.
     """
-    count, reach = grains.radii.size, side / 2
+    count, cutoff = grains.radii.size, side / 2
     if count > ALL_PAIRS_LIMIT:
-        reach = jnp.minimum(
-            reach, largest_cutoff(count, side, _capacity(OUTER_PAIRS_PER_GRAIN, count))
-        )
-    return reach - 2 * jnp.max(grains.radii)
+        grid_cutoff = largest_cutoff(count, side, _capacity(OUTER_PAIRS_PER_GRAIN, count))
+        cutoff = jnp.minimum(cutoff, grid_cutoff)
+    return cutoff - 2 * jnp.max(grains.radii)
 
 
 def _capacity(pairs_per_grain: int, count: int) -> int:
@@ -268,53 +217,46 @@ def _select(
       Where the pairs stand among the gaps, which slots of the buffer they fill, the skin, and
       whether even the smallest skin leaves pairs out.
     """
-    gaps, largest_skin = lax.stop_gradient(
-        (gaps, largest_skin)
-    )  # the choice of pairs has no derivative
+    # the choice of pairs has no derivative
+    gaps, largest_skin = lax.stop_gradient((gaps, largest_skin))
 
     def crowded(now: tuple[Array, Array]) -> Array:
         skin, words = now
-        return _overflows(words, capacity) & (skin > _LEAST_SHARE * largest_skin)
+        return (count_bits(words) > capacity) & (skin > _LEAST_SHARE * largest_skin)
 
     def narrower(now: tuple[Array, Array]) -> tuple[Array, Array]:
         skin = _NARROWER * now[0]
-        return where_active(crowded(now), (skin, bit_words(gaps <= skin)), now)
+        return where_active(crowded(now), (skin, pack_bits(gaps <= skin)), now)
 
-    widest = largest_skin, bit_words(gaps <= largest_skin)
+    widest = largest_skin, pack_bits(gaps <= largest_skin)
     skin, words = lax.while_loop(lambda now: any_replica(crowded(now)), narrower, widest)
-    index = set_bits(words, capacity, gaps.size)
+    index = bit_positions(words, capacity, gaps.size)
     filled = index < gaps.size
-    return jnp.where(filled, index, 0), filled, skin, _overflows(words, capacity)
-
-
-def _overflows(words: UInt32[Array, " words"], capacity: int) -> Bool[Array, ""]:
-    """Whether more bits are set than a buffer has slots."""
-    return jnp.sum(lax.population_count(words).astype(jnp.int32), dtype=jnp.int32) > capacity
+    return jnp.where(filled, index, 0), filled, skin, count_bits(words) > capacity
 
 
 def _pair_list(i, j, separations, filled, grains: Grains, skin, overflow) -> PairList:
     """The pairs i, j with their separations; a slot that is not filled is empty."""
     i, j = jnp.where(filled, i, 0), jnp.where(filled, j, 0)
+    far = jnp.asarray([[_FAR, 0]], separations.dtype)
     return PairList(
         i=i,
         j=j,
-        separations=jnp.where(
-            filled[:, None], separations, jnp.asarray([[1e6, 0]], separations.dtype)
-        ),
+        separations=jnp.where(filled[:, None], separations, far),
         reach=jnp.where(filled, taken(grains.radii, i) + taken(grains.radii, j), 0),
         skin=skin,
         overflow=overflow,
     )
 
 
-def _near_pairs(outer: PairList, frame: Frame, largest: Array, grains: Grains) -> PairList:
+def _near_pairs(outer: PairList, frame: Frame, largest_skin: Array, grains: Grains) -> PairList:
     """The pairs of the outer list within the largest skin now, with the frozen separations of the
     outer list.
     """
-    distance = jnp.sqrt(jnp.sum(separations_now(outer, frame) ** 2, axis=-1))
+    gaps = _lengths(separations_now(outer, frame)) - outer.reach
     capacity = _capacity(NEAR_PAIRS_PER_GRAIN, grains.radii.size)
-    at, filled, skin, overflow = _select(distance - outer.reach, largest, capacity)
-    i, j, separations = taken(outer.i, at), taken(outer.j, at), taken(outer.separations, at)
+    index, filled, skin, overflow = _select(gaps, largest_skin, capacity)
+    i, j, separations = (taken(x, index) for x in (outer.i, outer.j, outer.separations))
     return _pair_list(i, j, separations, filled, grains, skin, overflow | outer.overflow)
 
 
@@ -326,29 +268,25 @@ def outer_pairs(
     """
     count = positions.shape[0]
     capacity = _capacity(OUTER_PAIRS_PER_GRAIN, count)
-    largest = _nominal_skin(OUTER_PAIRS_PER_GRAIN, grains, side)
+    largest_skin = _nominal_skin(OUTER_PAIRS_PER_GRAIN, grains, side)
     if count > ALL_PAIRS_LIMIT:
-        i, j, missed = cell_list_pairs(
-            positions, side, tilt, largest + 2 * jnp.max(grains.radii), capacity
-        )
+        cutoff = largest_skin + 2 * jnp.max(grains.radii)
+        i, j, incomplete = cell_list_pairs(positions, side, tilt, cutoff, capacity)
         separations = displacement(taken(positions, i), taken(positions, j), side, tilt)
         reach = jnp.where(i == j, -jnp.inf, taken(grains.radii, i) + taken(grains.radii, j))
-        at, filled, skin, overflow = _select(
-            jnp.sqrt(jnp.sum(separations**2, axis=-1)) - reach, largest, capacity
-        )
-        i, j, overflow = taken(i, at), taken(j, at), overflow | missed
+        gaps = _lengths(separations) - reach
+        index, filled, skin, overflow = _select(gaps, largest_skin, capacity)
+        i, j, overflow = taken(i, index), taken(j, index), overflow | incomplete
     else:
         separations = displacement(positions[:, None], positions[None, :], side, tilt)
-        gaps = (
-            jnp.sqrt(jnp.sum(separations**2, axis=-1))
-            - grains.radii[:, None]
-            - grains.radii[None, :]
-        )
+        gaps = _lengths(separations) - grains.radii[:, None] - grains.radii[None, :]
         gaps = jnp.where(jnp.triu(jnp.ones((count, count), bool), 1), gaps, jnp.inf).reshape(-1)
-        at, filled, skin, overflow = _select(gaps, largest, capacity)
-        i, j = (
-            lax.div(at, jnp.int32(count)),
-            lax.rem(at, jnp.int32(count)),
-        )  # without the cases of negative numbers
+        index, filled, skin, overflow = _select(gaps, largest_skin, capacity)
+        # without the cases of negative numbers
+        i, j = lax.div(index, jnp.int32(count)), lax.rem(index, jnp.int32(count))
     separations = displacement(taken(positions, i), taken(positions, j), side, tilt)
     return _pair_list(i, j, separations, filled, grains, skin, overflow)
+
+
+def _lengths(separations: Float[Array, "*pairs 2"]) -> Float[Array, "*pairs"]:
+    return jnp.sqrt(jnp.sum(separations**2, axis=-1))

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxgran.contact.law import gap_coefficients, overlaps_within, time_to_touch
-from jaxgran.contact.near_pairs import set_bits
+from jaxgran.contact.compaction import bit_positions
+from jaxgran.contact.law import gap_coefficients, gap_discriminant, touching_time
 from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import relative_velocity
 from jaxgran.model.grains import Grains
@@ -83,7 +83,7 @@ def pair_motion(
 def is_contact(
     pairs: PairMotion, reach: Float[Array, " pairs"], look_ahead: float | Array
 ) -> tuple[Bool[Array, " pairs"], Bool[Array, " pairs"]]:
-    """Which pairs are contacts, and which of them approach.
+    """The activation rule: which pairs are contacts, and which of them approach.
 
     A pair is a contact when free flight over the look-ahead time θ·dt makes it overlap. Along the
     flight f(t) = |s + u t|² − d² falls until the closest approach, so f is read at θ·dt or at the
@@ -101,8 +101,13 @@ def is_contact(
       >>> [bool(is_contact(pairs, jnp.array([1.0]), time)[0][0]) for time in (0.9, 1.1)]
       [False, True]
     """
-    contact, approaching = overlaps_within(*gap_coefficients(*pairs, reach), look_ahead)
-    contact = contact & (reach > 0)
+    squared_speed, closing, excess = gap_coefficients(*pairs, reach)
+    approaching = closing < 0
+    closest = -closing / jnp.where(approaching, squared_speed, 1)
+    is_sooner = approaching & (-closing < squared_speed * look_ahead)
+    time = jnp.where(is_sooner, closest, look_ahead)
+    overlaps = excess + time * (2 * closing + time * squared_speed) <= 0
+    contact = overlaps & (reach > 0)
     return contact, contact & approaching
 
 
@@ -120,32 +125,13 @@ def first_contact_time(
       >>> float(time[0]), float(closest[0])
       (1.0, 2.0)
     """
-    return time_to_touch(*gap_coefficients(*pairs, reach))
-
-
-def contact_network(
-    used: Bool[Array, " contacts"],
-    i: Int[Array, " contacts"],
-    j: Int[Array, " contacts"],
-    pairs: PairMotion,
-    grains: Grains,
-) -> Contacts:
-    """The network of the pairs of grains i and j that are contacts (``used``), a slot for each
-    pair.
-    """
-    distances = jnp.sqrt(pairs.x * pairs.x + pairs.y * pairs.y)
-    inverse_distances, inverse_masses = jnp.where(used, 1 / distances, 0), 1 / grains.masses
-    nx, ny = inverse_distances * pairs.x, inverse_distances * pairs.y
-    return Contacts(
-        i=i,
-        j=j,
-        normals=jnp.stack([nx, ny], axis=-1),
-        distances=distances,
-        approach=nx * pairs.ux + ny * pairs.uy,
-        inverse_mass_i=jnp.where(used, taken(inverse_masses, i), 0),
-        inverse_mass_j=jnp.where(used, taken(inverse_masses, j), 0),
-        used=used,
-    )
+    squared_speed, closing, excess = gap_coefficients(*pairs, reach)
+    discriminant = gap_discriminant(squared_speed, closing, excess)
+    touches = (closing < 0) & (discriminant >= 0)
+    root = jnp.sqrt(jnp.where(touches, discriminant, 1))
+    time = touching_time(jnp.where(touches, closing, 0), excess, root)
+    closest = -closing / jnp.where(closing < 0, squared_speed, 1)
+    return jnp.where(touches, time, jnp.inf), closest
 
 
 class Touching(NamedTuple):
@@ -160,16 +146,27 @@ class Touching(NamedTuple):
     contact: Bool[Array, " pairs"]
 
     def compacted(self, size: int, words: Array) -> "Touching":
-        """The first contacts in a buffer of a size; ``words`` are those of
-        ``bit_words(contact)``.
-        """
+        """The first contacts in a buffer of a size; ``words`` is ``pack_bits(contact)``."""
         pairs = self.contact.size
-        place = set_bits(words, size, pairs)
-        used = place < pairs
-        index = jnp.where(used, place, 0)
+        position = bit_positions(words, size, pairs)
+        used = position < pairs
+        index = jnp.where(used, position, 0)
         i, j, reach, motion = jax.tree.map(lambda x: taken(x, index), self[:-1])
         return Touching(i, j, reach, motion, used)
 
     def network(self, grains: Grains) -> Contacts:
-        """The contact network."""
-        return contact_network(self.contact, self.i, self.j, self.motion, grains)
+        """The contact network, with a slot for each pair."""
+        pairs, used = self.motion, self.contact
+        distances = jnp.sqrt(pairs.x * pairs.x + pairs.y * pairs.y)
+        inverse_distances, inverse_masses = jnp.where(used, 1 / distances, 0), 1 / grains.masses
+        nx, ny = inverse_distances * pairs.x, inverse_distances * pairs.y
+        return Contacts(
+            i=self.i,
+            j=self.j,
+            normals=jnp.stack([nx, ny], axis=-1),
+            distances=distances,
+            approach=nx * pairs.ux + ny * pairs.uy,
+            inverse_mass_i=jnp.where(used, taken(inverse_masses, self.i), 0),
+            inverse_mass_j=jnp.where(used, taken(inverse_masses, self.j), 0),
+            used=used,
+        )

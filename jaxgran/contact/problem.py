@@ -6,6 +6,7 @@ whatever it needs. Shapes are checked even where JAX traces the values. Values t
 and end in a status: "ok" then still means that the residual is small, whatever the matrix is.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts are loaded when they are used
+from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxgran.contact.delassus import NetworkOperator
 from jaxgran.contact.network import Contacts
 from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import InputError, as_array, concrete_or_none, require, short_repr
@@ -66,6 +69,24 @@ class ContactNetwork:
         object.__setattr__(self, "ends", ends)
         _lists_as_arrays(self, "normals", "masses", "approach")
 
+    def operator(self) -> NetworkOperator:
+        """The Delassus operator of the network, with u⁻; distances, which no impulse depends on,
+        are one.
+        """
+        used = jnp.any(self.normals != 0, axis=-1)
+        (i, j), inverse = jnp.asarray(self.ends, jnp.int32).T, 1 / self.masses
+        contacts = Contacts(
+            i=i,
+            j=j,
+            normals=self.normals,
+            distances=jnp.ones_like(self.approach),
+            approach=jnp.where(used, self.approach, 0),
+            inverse_mass_i=jnp.where(used, inverse[i], 0),
+            inverse_mass_j=jnp.where(used, inverse[j], 0),
+            used=used,
+        )
+        return NetworkOperator(contacts, self.masses.size)
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -85,6 +106,10 @@ class DelassusProblem:
     A matrix of ``scipy.sparse`` becomes a ``BCOO``. Rows of the unit matrix with u⁻ = 0 fill up
     problems to a common size. A batch has a leading axis, which is a batch dimension of a ``BCOO``,
     and is solved by ``jax.vmap``. Derivatives are those along symmetric changes of the matrix.
+
+    The bound D of W knows no grains, only the entries of W. For any s > 0, 2 |x_c x_d| ≤ x_c²
+    s_d/s_c + x_d² s_c/s_d, so the diagonal Σ_d |W_cd| s_d/s_c bounds W (Gershgorin). With s_c =
+    W_cc^-½ it is ``spectral_bound``.
     """
 
     matrix: Any
@@ -99,6 +124,38 @@ class DelassusProblem:
             object.__setattr__(self, "matrix", BCOO.from_scipy_sparse(self.matrix))
         _lists_as_arrays(self, "matrix", "approach")
 
+    def operator(self) -> "DelassusProblem":
+        """Itself: it has the methods of a ``DelassusOperator``."""
+        return self
+
+    def product(self, impulses: Float[Array, " contacts"]) -> Float[Array, " contacts"]:
+        """W J, in full precision on every backend."""
+        matrix = self.matrix
+        if _is_sparse(matrix):
+            return self._row_sums(matrix.data * impulses[matrix.indices[:, 1]])
+        return jnp.matmul(matrix, impulses, precision=lax.Precision.HIGHEST)
+
+    def diagonal(self) -> Float[Array, " contacts"]:
+        """Diagonal of W; one where it is not positive."""
+        matrix = self.matrix
+        if _is_sparse(matrix):
+            rows, columns = matrix.indices[:, 0], matrix.indices[:, 1]
+            entries = self._row_sums(jnp.where(rows == columns, matrix.data, 0))
+        else:
+            entries = jnp.diagonal(matrix)
+        return jnp.where(entries > 0, entries, 1)
+
+    def spectral_bound(self) -> Float[Array, " contacts"]:
+        """Diagonal D with W ⪯ D."""
+        root = jnp.sqrt(self.diagonal())
+        bound = root * replace(self, matrix=abs(self.matrix)).product(1 / root)
+        return jnp.where(bound > 0, bound, 1)
+
+    def _row_sums(self, values: Array) -> Float[Array, " contacts"]:
+        """Sums over the stored entries of each row of a sparse matrix, of one value an entry."""
+        zeros = jnp.zeros(self.matrix.shape[0], values.dtype)
+        return zeros.at[self.matrix.indices[:, 0]].add(values)
+
 
 ContactProblem = ContactNetwork | DelassusProblem
 
@@ -108,35 +165,19 @@ def _lists_as_arrays(problem: Any, *names: str) -> None:
         object.__setattr__(problem, name, as_array(getattr(problem, name)))
 
 
-def is_sparse(matrix: Any) -> bool:
+def _is_sparse(matrix: Any) -> bool:
     """Whether this is a ``BCOO``, told without importing what is slow to import."""
     return hasattr(matrix, "indices") and hasattr(matrix, "data")
-
-
-def as_contacts(network: ContactNetwork) -> Contacts:
-    """The same network as the engines hold it; distances, which no impulse depends on, are one."""
-    used = jnp.any(network.normals != 0, axis=-1)
-    (i, j), inverse = jnp.asarray(network.ends, jnp.int32).T, 1 / network.masses
-    return Contacts(
-        i=i,
-        j=j,
-        normals=network.normals,
-        distances=jnp.ones_like(network.approach),
-        approach=jnp.where(used, network.approach, 0),
-        inverse_mass_i=jnp.where(used, inverse[i], 0),
-        inverse_mass_j=jnp.where(used, inverse[j], 0),
-        used=used,
-    )
 
 
 def as_problem(problem: ContactProblem) -> ContactProblem:
     """A contact problem that was checked, with all its numbers in one precision."""
     names = ("normals", "masses") if isinstance(problem, ContactNetwork) else ("matrix",)
     numbers = {name: getattr(problem, name) for name in (*names, "approach")}
-    kind = np.result_type(*(x.dtype for x in numbers.values()))
-    kind = kind if jnp.issubdtype(kind, jnp.floating) else np.float64
-    kind = jax.dtypes.canonicalize_dtype(kind)
-    return replace(problem, **{name: x.astype(kind) for name, x in numbers.items()})
+    common = np.result_type(*(x.dtype for x in numbers.values()))
+    is_float = jnp.issubdtype(common, jnp.floating)
+    dtype = jax.dtypes.canonicalize_dtype(common if is_float else np.float64)
+    return replace(problem, **{name: x.astype(dtype) for name, x in numbers.items()})
 
 
 def check_problem(problem: Any) -> None:
@@ -176,33 +217,37 @@ def _check_network(network: ContactNetwork, contacts: int) -> None:
         return
     lengths = np.linalg.norm(normals, axis=1)
     used = lengths > 0
-    wrong = used & (np.abs(lengths - 1) > _UNIT_LENGTH)
-    if np.any(wrong):
-        raise InputError(
-            f"normals must be unit vectors, and that of contact {np.argmax(wrong)} has the length "
-            f"{lengths[np.argmax(wrong)]:.6g}: divide it by its length."
-        )
+    _refuse_contact(
+        used & (np.abs(lengths - 1) > _UNIT_LENGTH),
+        lambda k: (
+            f"normals must be unit vectors, and that of contact {k} has the length "
+            f"{lengths[k]:.6g}: divide it by its length."
+        ),
+    )
     if ends is None:
         return
-    same_grain = used & (ends[:, 0] == ends[:, 1])
-    if np.any(same_grain):
-        raise InputError(
-            f"ends must be two different grains, and contact {np.argmax(same_grain)} has one grain "
-            "twice."
-        )
+    _refuse_contact(
+        used & (ends[:, 0] == ends[:, 1]),
+        lambda k: f"ends must be two different grains, and contact {k} has one grain twice.",
+    )
     if masses is None:
         return
-    two_walls = used & np.all(np.isinf(masses[ends]), axis=1)
-    if np.any(two_walls):
-        raise InputError(
-            f"contact {np.argmax(two_walls)} joins two walls, which no impulse moves: leave it out."
-        )
+    _refuse_contact(
+        used & np.all(np.isinf(masses[ends]), axis=1),
+        lambda k: f"contact {k} joins two walls, which no impulse moves: leave it out.",
+    )
+
+
+def _refuse_contact(wrong: np.ndarray, message: Callable[[int], str]) -> None:
+    """Raise an InputError about the first contact with which something is wrong."""
+    if np.any(wrong):
+        raise InputError(message(int(np.argmax(wrong))))
 
 
 def _check_delassus(problem: DelassusProblem, contacts: int) -> None:
     matrix: Any = problem.matrix
     require_shape("matrix", matrix, (contacts, contacts), "a row and a column for each contact")
-    sparse = is_sparse(matrix)
+    sparse = _is_sparse(matrix)
     if sparse and (matrix.n_batch or matrix.n_dense):
         raise InputError(
             "a sparse matrix must have neither batch nor dense dimensions: use "

@@ -1,8 +1,8 @@
 """The projected methods: how one iterate of a contact solve follows from those before it.
 
-All of them take projected steps J ← max(0, y − t D⁻¹(W y + u⁻)) from a point y, with the diagonal D
-of ``delassus.spectral_bound``, and cost one product with W each. They differ in y and in the step
-length t:
+All of them take projected steps J ← max(0, y − t D⁻¹(W y + u⁻)) from a point y, with D the
+``spectral_bound`` of ``delassus``, and cost one product with W each. They differ in y and in the
+step length t:
 
 =================  ==============================  =================================================
 method             point y                         step length t
@@ -39,7 +39,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxgran.contact.delassus import Operator, spectral_bound
+from jaxgran.contact.delassus import DelassusOperator
 from jaxgran.contact.law import LONGEST_STRIDE, PROGRESS, WINDOW
 from jaxgran.model.checks import InputError, concrete_or_none, require_number, short_repr
 from jaxgran.model.choices import SolverName
@@ -120,14 +120,9 @@ class ProjectedMethod:
             words,
         )
 
-    def bound(self, contacts: Operator, grains: int) -> Float[Array, " contacts"]:
-        """Diagonal D of positive numbers in place of W, see ``delassus``.
-
-        Args:
-          contacts: the contact network, or a problem given by its matrix.
-          grains: number of grains; 0 with a matrix.
-        """
-        return spectral_bound(contacts, grains)
+    def bound(self, operator: DelassusOperator) -> Float[Array, " contacts"]:
+        """Diagonal D of positive numbers in place of W, see ``delassus``."""
+        return operator.spectral_bound()
 
     def init(self, approach: Float[Array, " contacts"]) -> Any:
         """What the method remembers between iterations, at the start: a pytree of floats;

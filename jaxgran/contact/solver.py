@@ -20,8 +20,8 @@ nor are their derivatives: one solution is returned. The set A is that of the so
 derivatives want a small tolerance (1e-8 or less).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -31,9 +31,8 @@ from jax import lax
 from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Int
 
-from jaxgran.contact.delassus import Operator, delassus_product, diagonal
+from jaxgran.contact.delassus import DelassusOperator, NetworkOperator
 from jaxgran.contact.law import JAMMED_RESPONSE, relative_residual, residual_target
-from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import Iterate, ProjectedMethod, dot
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.status import Status
@@ -55,10 +54,19 @@ class Solution:
     status: Int[Array, ""]  # ok, iteration_limit, infeasible or nonfinite
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def natural_map(
+    diagonal: Float[Array, " contacts"],
+    impulses: Float[Array, " contacts"],
+    after: Float[Array, " contacts"],
+) -> Float[Array, ""]:
+    """The residual ‖min(W_cc J, w)‖ with w the velocities after; zero at a solution."""
+    error = jnp.minimum(diagonal * impulses, after)
+    return jnp.sqrt(dot(error, error))
+
+
+@jax.custom_jvp
 def solve(
-    contacts: Operator,
-    grains: int,
+    operator: DelassusOperator,
     shear_rate: float | Array,
     solver: ProjectedMethod,
     active: Array,
@@ -66,17 +74,16 @@ def solve(
     """Impulses J₀ of the network at restitution zero: 0 ≤ J₀ ⟂ W J₀ + u⁻ ≥ 0.
 
     Args:
-      contacts: the network, or a problem given by its matrix.
-      grains: number of grains; not used with a matrix.
+      operator: W and u⁻ of the contacts.
       shear_rate: γ̇; sets the absolute floor of the residual.
       solver: the projected method, with its tolerance and its largest number of iterations.
       active: whether this replica has something to solve; others of its batch return zero impulses.
 
-    Impulses and response have derivatives with respect to the network, see the module; all else has
-    none.
+    Impulses and response have derivatives with respect to the operator, see the module; all else
+    has none.
     """
-    b, w_diagonal = contacts.approach, diagonal(contacts, grains)
-    bound = solver.bound(contacts, grains)
+    b, w_diagonal = operator.approach, operator.diagonal()
+    bound = solver.bound(operator)
     closing = jnp.minimum(b, 0)
     scale = jnp.sqrt(dot(closing, closing))
     tolerance = jnp.asarray(solver.tolerance, b.dtype)
@@ -91,10 +98,9 @@ def solve(
         at, iterations = now.at, now.at.iterations + 1
         origin, step = as_numbers(solver.propose(at))
         impulses = jnp.maximum(0, origin[0] - step * (origin[1] + b) / bound)
-        response = delassus_product(contacts, impulses, grains)
+        response = operator.product(impulses)
         point = jnp.stack([impulses, response])
-        error = jnp.minimum(w_diagonal * impulses, response + b)
-        residual = jnp.sqrt(dot(error, error))
+        residual = natural_map(w_diagonal, impulses, response + b)
         better = residual < at.best_residual
         best_residual = jnp.where(better, residual, at.best_residual)
         memory = as_numbers(solver.learn(at, origin, point, bound, best_residual))
@@ -123,62 +129,59 @@ def solve(
     capped = active & ~(end.residual <= target)
     jammed = lax.cond(any_replica(capped), is_jammed, lambda: jnp.bool_(False))
     failure = jnp.where(jammed, Status.infeasible, Status.iteration_limit)
-    status = jnp.where(capped, failure, Status.ok)
+    nonfinite = active & ~jnp.isfinite(end.at.best_residual)
+    status = jnp.where(nonfinite, Status.nonfinite, jnp.where(capped, failure, Status.ok))
     return Solution(
         impulses=impulses,
         response=response,
         residual=jnp.where(active, relative_residual(end.at.best_residual, scale, target), 0),
         iterations=end.at.iterations,
-        status=jnp.where(
-            active & ~jnp.isfinite(end.at.best_residual), Status.nonfinite, status
-        ).astype(jnp.int32),
+        status=status.astype(jnp.int32),
     )
 
 
 @solve.defjvp
-def _solve_jvp(grains: int, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
-    contacts, shear_rate, solver, active = primals
-    solution = solve(contacts, grains, shear_rate, solver, active)
+def _solve_jvp(primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
+    operator, change = primals[0], tangents[0]
+    solution = solve(*primals)
     impulses, loaded = solution.impulses, solution.impulses > 0
-    w_diagonal = diagonal(contacts, grains)
+    w_diagonal = operator.diagonal()
 
-    def loaded_product(change: Array) -> Array:
+    def loaded_product(x: Array) -> Array:
         """W_AA on the contacts that press, and the identity on the others."""
-        felt = delassus_product(contacts, jnp.where(loaded, change, 0), grains)
-        return jnp.where(loaded, felt, change)
+        return jnp.where(loaded, operator.product(jnp.where(loaded, x, 0)), x)
 
-    def solved(operator, wanted: Array) -> Array:
-        change, _ = cg(
-            operator,
-            wanted,
+    def by_conjugate_gradients(matvec: Callable, target: Array) -> Array:
+        x, _ = cg(
+            matvec,
+            target,
             tol=_DERIVATIVE_TOLERANCE,
             maxiter=_DERIVATIVE_ITERATIONS * impulses.size,
-            M=lambda x: x / w_diagonal,
+            M=lambda residual: residual / w_diagonal,
         )
-        missed = wanted - operator(change)
-        good = dot(missed, missed) <= _WORST_DERIVATIVE**2 * dot(wanted, wanted)
-        return jnp.where(good, change, jnp.nan)
+        residual = target - matvec(x)
+        converged = dot(residual, residual) <= _WORST_DERIVATIVE**2 * dot(target, target)
+        return jnp.where(converged, x, jnp.nan)
 
-    change = tangents[0]
-    _, response_change = jax.jvp(
-        lambda operator: delassus_product(operator, impulses, grains), (contacts,), (change,)
+    _, response_change = jax.jvp(lambda w: w.product(impulses), (operator,), (change,))
+    target = jnp.where(loaded, -(response_change + change.approach), 0)
+    impulse_change = lax.custom_linear_solve(
+        loaded_product, target, by_conjugate_gradients, symmetric=True
     )
-    wanted = jnp.where(loaded, -(response_change + change.approach), 0)
-    impulse_change = lax.custom_linear_solve(loaded_product, wanted, solved, symmetric=True)
-    none: Any = np.zeros((), jax.dtypes.float0)
+    no_tangent: Any = np.zeros((), jax.dtypes.float0)
     return solution, Solution(
         impulses=impulse_change,
-        response=response_change + delassus_product(contacts, impulse_change, grains),
+        response=response_change + operator.product(impulse_change),
         residual=jnp.zeros_like(solution.residual),
-        iterations=none,
-        status=none,
+        iterations=no_tangent,
+        status=no_tangent,
     )
 
 
-def single_contact(network: Contacts, grains: int) -> Solution:
+def single_contact(operator: NetworkOperator) -> Solution:
     """The closed form of a single contact, for which the iteration would need one product."""
-    w_diagonal = diagonal(network, grains)
-    impulses = jnp.maximum(0, -network.approach / w_diagonal)
+    w_diagonal = operator.diagonal()
+    impulses = jnp.maximum(0, -operator.approach / w_diagonal)
     status = jnp.where(jnp.any(jnp.isnan(impulses)), Status.nonfinite, Status.ok).astype(jnp.int32)
     return Solution(
         impulses, w_diagonal * impulses, jnp.zeros((), impulses.dtype), jnp.int32(1), status

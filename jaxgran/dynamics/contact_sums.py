@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxgran.contact.delassus import diagonal, loads_of_grains
+from jaxgran.contact.delassus import NetworkOperator, loads_of_grains
 from jaxgran.contact.law import SolvedContact, contact_terms
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.solver import Solution
@@ -41,7 +41,7 @@ def impulses_of(flow: ShearFlow, network: Contacts, grains: Grains, solution: So
     one_plus_alpha, count = 1 + flow.restitution, grains.radii.size
     impulses = one_plus_alpha * solution.impulses
     stopping = one_plus_alpha * jnp.maximum(0, -network.approach)
-    binary = stopping / diagonal(network, count)
+    binary = stopping / NetworkOperator(network, count).diagonal()
     changes = one_plus_alpha * solution.response
     return Impulses(impulses, binary, changes, *loads_of_grains(network, impulses, count))
 

@@ -33,9 +33,9 @@ def contact_delays(
 
 def is_binary(near: PairList, contact: Array, grains: Grains) -> Bool[Array, " pairs"]:
     """Which pairs are contacts of two grains that have no other one."""
-    met = contact.astype(jnp.int32)
-    none = jnp.zeros(grains.radii.size, jnp.int32)
-    degree = added_at(added_at(none, near.i, met), near.j, met)
+    counted = contact.astype(jnp.int32)
+    zeros = jnp.zeros(grains.radii.size, jnp.int32)
+    degree = added_at(added_at(zeros, near.i, counted), near.j, counted)
     return contact & (taken(degree, near.i) == 1) & (taken(degree, near.j) == 1)
 
 

@@ -11,7 +11,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Int
 
-from jaxgran.contact.near_pairs import bit_words, outer_pairs
+from jaxgran.contact.compaction import pack_bits
+from jaxgran.contact.delassus import NetworkOperator
+from jaxgran.contact.near_pairs import outer_pairs
 from jaxgran.contact.network import MOST_CONTACTS, Contacts, Touching, is_contact, pair_motion
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.contact.solver import solve
@@ -33,7 +35,8 @@ def snapshot(flow: ShearFlow, state: State, solver: ProjectedMethod = DEFAULT_SO
     moves.
     """
     network, status = contacts_now(flow, state)
-    solution = solve(network, flow.grains, flow.shear_rate, solver, jnp.any(network.approach < 0))
+    operator, approaches = NetworkOperator(network, flow.grains), jnp.any(network.approach < 0)
+    solution = solve(operator, flow.shear_rate, solver, approaches)
     restitution = jnp.asarray(flow.restitution, state.side.dtype)
     return snapshot_of(
         flow,
@@ -61,7 +64,7 @@ def contacts_now(flow: ShearFlow, state: State) -> tuple[Contacts, Int[Array, ""
     missing = ~suffices | pairs.overflow | (jnp.sum(contact, dtype=jnp.int32) > room)
     status = jnp.where(missing, Status.capacity, Status.ok).astype(jnp.int32)
     touching = Touching(pairs.i, pairs.j, pairs.reach, motion, contact)
-    return touching.compacted(room, bit_words(contact)).network(grains), status
+    return touching.compacted(room, pack_bits(contact)).network(grains), status
 
 
 def snapshot_series(

@@ -21,11 +21,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxgran.contact.compaction import count_bits, pack_bits
+from jaxgran.contact.delassus import NetworkOperator
 from jaxgran.contact.law import first_step, flight_of, kinetic_means
 from jaxgran.contact.near_pairs import (
     Frame,
     PairLists,
-    bit_words,
     no_lists,
     present,
     refresh,
@@ -280,19 +281,18 @@ def collide(constants: Constants, now: Carry, needs_solve: Bool[Array, ""]) -> C
     near, grains, flow = now.lists.near, constants.grains, constants.flow
     look_ahead = flow.activation * flow.timestep
     all_contacts, approaching = is_contact(now.pairs, near.reach, look_ahead)
-    acts = needs_solve & jnp.any(bit_words(approaching) > 0)
+    acts = needs_solve & jnp.any(pack_bits(approaching) > 0)
     contact, motion, delays = all_contacts & acts, now.pairs, None
     if constants.moving_contacts:
         delays = contact_delays(now.pairs, near.reach, approaching, flow.timestep)
         motion = now.pairs.moved(jnp.where(is_binary(near, contact, grains), delays, 0))
-    touching, words = Touching(near.i, near.j, near.reach, motion, contact), bit_words(contact)
+    touching, words = Touching(near.i, near.j, near.reach, motion, contact), pack_bits(contact)
 
     sizes = (1, *constants.buffers) if constants.buffers else ()
     in_buffer = partial(_collision_in_buffer, constants, now, touching, words)
     on_list = partial(_collision, constants, now, touching, delays)
     programs = [*(partial(in_buffer, size) for size in sizes), on_list]
-    count = jnp.sum(lax.population_count(words).astype(jnp.int32), dtype=jnp.int32)
-    branch = jnp.sum(count > jnp.asarray([0, *sizes], jnp.int32), dtype=jnp.int32)
+    branch = jnp.sum(count_bits(words) > jnp.asarray([0, *sizes], jnp.int32), dtype=jnp.int32)
     collision = switch_replica(branch, _no_collision(now, delays), programs)
 
     kicks = collision.momenta / grains.masses[:, None]
@@ -343,11 +343,12 @@ def _collision(
 ) -> Collision:
     """What contacts do, from their network and its solution."""
     flow, grains = constants.flow, constants.grains
-    network, count = touching.network(grains), grains.radii.size
+    network = touching.network(grains)
+    operator = NetworkOperator(network, grains.radii.size)
     if single:
-        solution = single_contact(network, count)
+        solution = single_contact(operator)
     else:
-        solution = solve(network, count, flow.shear_rate, constants.solver, active)
+        solution = solve(operator, flow.shear_rate, constants.solver, active)
     impulses = impulses_of(flow, network, grains, solution)
     contact_sums, largest_overlap = sums_of_contacts(flow, touching.reach, network, impulses)
     user_sums, observe_now = now.sums.user_sums, observer_of(constants, now)

@@ -13,9 +13,8 @@ class Mixture(NamedTuple):
     diameters: Float[Array, " classes"]
     masses: Float[Array, " classes"]
     number_densities: Float[Array, " classes"]  # grains per unit area
-    encounters: Float[
-        Array, "classes classes"
-    ]  # number density of the second class times the contact diameter and χ
+    # number density of the second class times the contact diameter and χ
+    encounters: Float[Array, "classes classes"]
 
     @property
     def contact_diameters(self) -> Float[Array, "classes classes"]:

@@ -2,8 +2,7 @@
 restitution.
 
 It neglects correlations between the velocities of neighbours, so it fails near jamming and in dense
-flow at small
-restitution. Units: ``steady_shear``.
+flow at small restitution. Units: ``steady_shear``.
 """
 
 import jax.numpy as jnp
@@ -55,17 +54,15 @@ def garzo_dufty(
     relaxation = 3 * chi / 8 * (7 / 3 - alpha) * (1 + alpha) * (1 + 7 * kurtosis / 16)
     kinetic = (1 - (1 + alpha) * (1 - 3 * alpha) * nu * chi / 4) / (relaxation - cooling / 2)
     bulk = 8 / jnp.pi * nu**2 * chi * (1 + alpha) * (1 - kurtosis / 16)
-    viscosity = (
-        kinetic * (1 + (1 + alpha) * nu * chi / 2) + bulk / 2
-    )  # in units of the dilute elastic viscosity
+    # in units of the dilute elastic viscosity
+    viscosity = kinetic * (1 + (1 + alpha) * nu * chi / 2) + bulk / 2
     temperature = jnp.pi / (64 * nu**2) * viscosity / cooling * rate**2
     dilute_viscosity = jnp.sqrt(temperature / (4 * jnp.pi))
+    maxwellian = maxwellian_collision_rate(density, chi, temperature)
     return SteadyShear(
         granular_temperature=temperature,
         pressure=density * temperature * (1 + (1 + alpha) * nu * chi),
         shear_stress=viscosity * dilute_viscosity * rate,
-        collision_rate=maxwellian_collision_rate(density, chi, temperature)
-        * (1 - kurtosis / 16)
-        / rate,
+        collision_rate=maxwellian * (1 - kurtosis / 16) / rate,
         dissipation_rate=cooling * (density * temperature) ** 2 / dilute_viscosity,
     )
