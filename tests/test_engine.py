@@ -13,7 +13,6 @@ from flows import GRAINS, assert_same_bits
 from synthetic import refused
 
 import jaxgran as jg
-from jaxgran.cache import persistent_jit
 from jaxgran.contact.projected_methods import solver_name
 from jaxgran.dynamics import advance
 from jaxgran.dynamics.engine import Numerics, _warn_once, in_lockstep, select_engine
@@ -193,7 +192,6 @@ def test_the_default_device_chooses_the_engine_not_the_backend(flowing, monkeypa
     flows, states = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), (of(), flowing(0.7)))
     with jax.default_device(jax.devices("cpu")[0]):
         assert not in_lockstep()
-        assert persistent_jit._folder() is not None  # programs for the processor are kept on disk
         _, tally = jg.advance(flows, states, STEPS, engine=jg.Numba())
     assert np.all(np.asarray(tally.steps) == int(STEPS))
 

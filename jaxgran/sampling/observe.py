@@ -17,9 +17,8 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.contact.network import MOST_CONTACTS, Contacts
-from jaxgran.dynamics.advance import advance, register_numba
+from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.batch import predicted_cost, run_batch
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.observed_advance import advance_observed
@@ -116,7 +115,7 @@ def advance_and_observe(
     return end, replace(tally, observed=sums)
 
 
-_advance_replica = persistent_jit(advance_and_observe, register_numba)
+_advance_replica = jax.jit(advance_and_observe)
 _observe_replica = jax.jit(advance_and_observe, static_argnames="observe")
 
 

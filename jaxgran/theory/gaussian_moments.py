@@ -170,8 +170,7 @@ def _newton(function, start):
 def _dense_solve(linear, side):
     """Solve ``linear(x) = side`` for a dozen unknowns, by the inverse of the matrix.
 
-    It is found by Gauss-Jordan elimination with partial pivoting. ``jnp.linalg`` would call LAPACK,
-    and ``persistent_jit`` does not keep programs that do.
+    It is found by Gauss-Jordan elimination with partial pivoting.
     """
     size = side.size
     places = jnp.arange(size)
