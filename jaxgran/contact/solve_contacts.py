@@ -32,16 +32,15 @@ from jaxgran.contact.projected_methods import (
     require_solver,
 )
 from jaxgran.contact.solver import solve
-from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import as_array, require_number
 from jaxgran.model.flow import RANGES
+from jaxgran.model.values import Value
 
 _DEFAULT = BarzilaiBorwein(tolerance=1e-6)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class ContactResiduals:
+@dataclass(frozen=True, eq=False, repr=False)
+class ContactResiduals(Value):
     """How far impulses J are from a solution; all are zero at one, and none has a derivative.
 
     ==================  =====  ====  ===============================================================
@@ -67,12 +66,9 @@ class ContactResiduals:
     approach: Float[Array, ""]
     tension: Float[Array, ""]
 
-    __eq__ = equal_values
 
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class ContactSolution:
+@dataclass(frozen=True, eq=False, repr=False)
+class ContactSolution(Value):
     """Impulses of a contact problem, and how good they are.
 
     ==========  ================  ====  =========================================================
@@ -91,8 +87,6 @@ class ContactSolution:
     residuals: ContactResiduals
     iterations: Int[Array, ""]
     status: Int[Array, ""]
-
-    __eq__ = equal_values
 
 
 def solve_contacts(
