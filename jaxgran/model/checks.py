@@ -26,12 +26,8 @@ class InputError(ValueError):
         super().__init__(message)
         self.field, self.value, self.reason = field, value, reason
 
-    def __reduce__(self):  # errors of other processes are pickled
-        return _input_error, (str(self), self.field, self.reason)
-
-
-def _input_error(message: str, field: str, reason: str) -> InputError:
-    return InputError(message, field=field, reason=reason)
+    def __reduce__(self):  # errors of other processes are pickled, whatever the value is
+        return InputError, self.args, {"field": self.field, "reason": self.reason}
 
 
 def refused(field: str, value: Any, reason: str) -> InputError:

@@ -159,15 +159,9 @@ def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:
     if not is_traced(strain, flow.shear_rate, flow.timestep):
         step = float(np.asarray(flow.shear_rate) * np.asarray(flow.timestep))
         least, most = parts * step, MAX_STEPS * step
-        require(
-            "strain", strain, lambda x: x >= 0.99 * least, f"at least {parts} time steps, {least:g}"
-        )
-        require(
-            "strain",
-            strain,
-            lambda x: x <= most,
-            f"at most {MAX_STEPS} time steps, {two_digits(most, up=False)}",
-        )
+        few, many = f"at least {parts} time steps, {least:g}", f"at most {MAX_STEPS} time steps, "
+        require("strain", strain, lambda x: x >= 0.99 * least, few)
+        require("strain", strain, lambda x: x <= most, many + two_digits(most, up=False))
 
 
 def steps_of_strain(flow: ShearFlow, strain: Any) -> Any:
