@@ -61,7 +61,7 @@ def hardware() -> dict[str, str | int]:
     return {
         "processor": environment.processor(),
         "cores": os.cpu_count() or 0,
-        "system": environment.system(),
+        "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         **environment.versions(PACKAGES),
         "commit": f"{commit}-dirty" if uncommitted() else commit,

@@ -27,16 +27,19 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
     An OSError of the block names ``path``.
     """
-    file = Path(os.path.realpath(path)) if path.is_symlink() else path
+    file = Path(os.path.realpath(path))
     temporary = file.with_name(f".{file.stem}-{secrets.token_hex(8)}{file.suffix}")
     try:
         yield temporary
-        _sync(temporary)
+        with temporary.open("rb+") as written:
+            os.fsync(written)
         with suppress(FileNotFoundError, PermissionError):
             shutil.copymode(file, temporary)
         os.replace(temporary, file)
         if os.name == "posix":  # on other systems a folder cannot be opened
-            _sync(file.parent)
+            folder = os.open(file.parent, os.O_RDONLY)
+            os.fsync(folder)
+            os.close(folder)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
@@ -63,9 +66,7 @@ def file_lock(path: Path) -> Iterator[None]:
 
 def lock_file(path: Path, wait: bool) -> int | None:
     """Lock a file, made with its folder if missing, until the handle is closed or this process
-    ends.
-
-    On a system without locks there is no handle, and no other process is noticed.
+    ends; None on a system without locks.
 
     Raises:
       BlockingIOError: another process has locked it, and ``wait`` is False.
@@ -101,17 +102,28 @@ def is_locked(path: Path, handle: int | None) -> bool:
         return False
 
 
+def write_cached(path: Path, content: bytes, most: int) -> None:
+    """Write a cache file, then remove the oldest files with its suffix beyond the newest ``most``.
+
+    Raises:
+      OSError: the folder cannot be created or written to.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content + hashlib.sha256(content).digest())
+    with suppress(OSError):
+        files = path.parent.glob(f"*{path.suffix}")
+        for old in sorted(files, key=lambda file: file.stat().st_mtime)[:-most]:
+            old.unlink(missing_ok=True)
+
+
 def read_cached(path: Path) -> bytes | None:
     """The content of a cache file; None if it is missing or damaged."""
     with suppress(OSError):
         stored = path.read_bytes()
-        content = stored[:-_DIGEST]
-        return content if _with_checksum(content) == stored else None
+        content, digest = stored[:-_DIGEST], stored[-_DIGEST:]
+        return content if hashlib.sha256(content).digest() == digest else None
     return None
-
-
-def _with_checksum(content: bytes) -> bytes:
-    return content + hashlib.sha256(content).digest()
 
 
 def other_version(name: str, stored: object, version: int | str) -> str:
@@ -122,29 +134,3 @@ def other_version(name: str, stored: object, version: int | str) -> str:
         return ""
     has = "no format_version" if stored is None else f"format_version {stored}"
     return f"{name} has {has}, and this version of jaxgran reads format_version {version}."
-
-
-def write_cached(path: Path, content: bytes, most: int) -> None:
-    """Write a cache file, then remove the oldest files with its suffix beyond the newest ``most``.
-
-    Raises:
-      OSError: the folder cannot be created or written to.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(_with_checksum(content))
-    with suppress(OSError):
-        newest_first = sorted(
-            path.parent.glob(f"*{path.suffix}"), key=lambda x: x.stat().st_mtime, reverse=True
-        )
-        for old in newest_first[most:]:
-            old.unlink(missing_ok=True)
-
-
-def _sync(path: Path) -> None:
-    """Flush a file or a folder to disk."""
-    handle = os.open(path, os.O_RDWR if path.is_file() else os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

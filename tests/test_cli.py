@@ -37,6 +37,7 @@ from synthetic import random_replica, refused
 from jaxgran.cli import app, options
 from jaxgran.cli import map as map_module
 from jaxgran.cli import run as run_module
+from jaxgran.cli.output import in_brackets
 from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
 from jaxgran.io import trajectory
@@ -47,7 +48,7 @@ from jaxgran.maps.schema import flattened, path_of
 from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.start import combined
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.model.display import in_brackets, with_error
+from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
 from jaxgran.plotting.map_figures import FIGURES
 from jaxgran.sampling.observables import OBSERVABLES

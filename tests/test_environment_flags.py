@@ -8,7 +8,8 @@ import pytest
 from command_line import in_a_process
 
 from jaxgran.cache import folder
-from jaxgran.environment import random_bits, usable_cores
+from jaxgran.environment import usable_cores
+from jaxgran.maps.provenance import random_bits
 from jaxgran.maps.replica import ReplicaId
 from jaxgran.maps.run_replicas import _folded_key, random_key
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 import jaxgran as jg
 from benchmarks import reference
-from jaxgran.model.display import in_brackets
+from jaxgran.cli.output import in_brackets
 from jaxgran.reference.surface import Shape, Surface
 from jaxgran.reference.table import FACTORS, MEASURED, shipped_table
 from jaxgran.reference.validity import Validity

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jaxgran.cli.output import in_brackets
 from jaxgran.maps.results import open_map
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.model.display import in_brackets
 
 pytestmark = [
     pytest.mark.environment,

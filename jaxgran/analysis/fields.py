@@ -30,7 +30,6 @@ from jax.scipy.special import erf
 from jaxtyping import Array, Float, Int
 
 from jaxgran.dynamics.snapshot import Snapshot, collided
-from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import displacement
 from jaxgran.model.checks import (
     InputError,
@@ -41,15 +40,15 @@ from jaxgran.model.checks import (
     require_number,
 )
 from jaxgran.model.state import State
+from jaxgran.model.values import Value
 
 _REACH = 6.0  # widths, at which the Gaussian has fallen to e⁻¹⁸ = 1.5e-8 of its peak
 _NEGLIGIBLE = 9.0  # widths, at which it is e⁻⁴⁰ = 3e-18 of its peak, below rounding
 _BLOCK = 128  # points, grains or contacts
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Fields:
+@dataclass(frozen=True, eq=False, repr=False)
+class Fields(Value):
     """Coarse-grained fields at points of the plane, in the laboratory frame (mean velocity γ̇ y
     x̂).
 
@@ -83,8 +82,6 @@ class Fields:
     contact_stress: Float[Array, "points 2 2"]
     heat_flux: Float[Array, "points 2"]
     dissipation: Float[Array, " points"]
-
-    __eq__ = equal_values
 
     @property
     def stress(self) -> Float[Array, "points 2 2"]:

@@ -23,13 +23,13 @@ from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.advance import advance, count_events, require_advance
 from jaxgran.dynamics.batch import checked_batch
 from jaxgran.dynamics.engine import Jax
-from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import displacement
 from jaxgran.model.checks import InputError, require_number, require_untraced, require_whole
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
+from jaxgran.model.values import Value
 
 # σ, largest rms of ∂(position)/∂α: beyond it, another α of the same order leads to other collisions
 HORIZON = 1.0
@@ -40,9 +40,8 @@ _SOLVED = 1e-8  # residual of conjugate gradients, over the right-hand side
 _SOLVER = BarzilaiBorwein(tolerance=1e-9, max_steps=20_000)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class TrajectoryFit:
+@dataclass(frozen=True, eq=False, repr=False)
+class TrajectoryFit(Value):
     """A fit of the restitution to windows of a flow.
 
     ===========  ====================  ====  =======================================================
@@ -61,8 +60,6 @@ class TrajectoryFit:
     misfit: Float[np.ndarray, " iterations"]
     velocities: Float[np.ndarray, "windows grains 2"] | None = None
     positions: Float[np.ndarray, "windows grains 2"] | None = None
-
-    __eq__ = equal_values
 
 
 def fit_trajectory(

@@ -1,5 +1,4 @@
-"""The cache of compiled programs on disk.
+"""The cache of compiled programs on disk: where it is, and that JAX uses it.
 
-It imports `environment` and `files` only. `folder` locates the cache; `persistent_jit` stores
-compiled functions there.
+It imports `environment` only.
 """

@@ -1,5 +1,5 @@
-"""The folder of the compilation cache: in the user's cache folder, or a temporary one if that is
-not writable.
+"""The folder of compiled programs: in the user's cache folder, or a temporary one if that is not
+writable.
 """
 
 import os
@@ -7,11 +7,10 @@ import stat
 import tempfile
 import warnings
 from pathlib import Path
-from typing import Any
 
 from platformdirs import user_cache_path
 
-from jaxgran.environment import default_device, processor_kind
+from jaxgran.environment import default_device
 
 _SHORTEST_COMPILATION = 0.3  # seconds; faster compilations are not cached
 
@@ -19,69 +18,53 @@ _SHORTEST_COMPILATION = 0.3  # seconds; faster compilations are not cached
 def use_cache() -> None:
     """Keep compiled programs on disk from now on, so that later processes start without compiling.
 
-    It sets JAX's ``jax_compilation_cache_dir`` to a folder in the user's cache folder, one for each
-    kind of processor, and ``jax_persistent_cache_min_compile_time_secs`` to 0.3. Programs of the
-    user are then kept, too. A folder that JAX has already, and a cache that
-    ``jax_enable_compilation_cache`` turns off, are left as they are. If the user's cache folder is
-    not writable, a temporary one is used and a warning names it. Call it before the first
-    computation; the command line does.
+    It sets JAX's ``jax_compilation_cache_dir`` to a folder in the user's cache folder, and
+    ``jax_persistent_cache_min_compile_time_secs`` to 0.3. Programs of the user are then kept, too.
+    A folder that JAX has already, and a cache that ``jax_enable_compilation_cache`` turns off, are
+    left as they are. If the user's cache folder is not writable, a temporary one is used and a
+    warning names it. Call it before the first computation; the command line does.
     """
-    import jax
+    from jax import config
 
-    config: Any = jax.config  # whose flags are attributes
-    if config.jax_compilation_cache_dir or not config.jax_enable_compilation_cache:
+    flags = config.values
+    if flags["jax_compilation_cache_dir"] or not flags["jax_enable_compilation_cache"]:
         return
     if message := fallback_message():
         warnings.warn(message, stacklevel=2)
-    folder = cache_folder()
-    if folder is None:
-        return
-    config.update("jax_compilation_cache_dir", str(folder / processor_kind()))
-    config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST_COMPILATION)
-    if (
-        os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1" and default_device().platform == "cpu"
-    ):  # JAX itself sets 1
-        _silence_loader(config)
+    if folder := cache_folder():
+        config.update("jax_compilation_cache_dir", str(folder / "xla"))
+        config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST_COMPILATION)
+        level = flags["jax_logging_level"]
+        unset = level in (None, "NOTSET") and os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1"
+        if unset and default_device().platform == "cpu":
+            # XLA logs a harmless error for each program that it loads, as it takes tuning hints for
+            # instruction sets. JAX sets the level of its log with its own, but does not set it back
+            config.update("jax_logging_level", "CRITICAL")
+            config.update("jax_logging_level", level)
 
 
 def programs_folder() -> Path | None:
     """The folder where JAX caches compiled programs; None if it caches none, or in a storage that
     has an address, such as gs://bucket.
     """
-    import jax
+    from jax import config
 
-    config: Any = jax.config
-    folder = config.jax_enable_compilation_cache and config.jax_compilation_cache_dir
+    flags = config.values
+    folder = flags["jax_enable_compilation_cache"] and flags["jax_compilation_cache_dir"]
     return Path(folder) if folder and "://" not in folder else None
-
-
-def _silence_loader(config: Any) -> None:
-    """Keep XLA from logging a long, harmless error for each program that it loads: it takes tuning
-    hints for features.
-
-    JAX sets the level of XLA's log together with that of its own, but sets back only its own.
-    """
-    before = config.jax_logging_level
-    if before in (None, "NOTSET"):
-        config.update("jax_logging_level", "CRITICAL")
-        config.update("jax_logging_level", before)
 
 
 def fallback_message() -> str:
     """One sentence that says why the user's cache folder is not used and what is used instead; ""
     if it is used.
     """
-    folder = cache_folder()
-    if folder == users_folder():
+    users, folder = users_folder(), cache_folder()
+    if folder == users:
         return ""
-    instead = (
-        "every run compiles anew"
-        if folder is None
-        else f"compiled programs are kept in {str(folder)!r}"
-    )
+    kept = f"compiled programs are kept in {str(folder)!r}" if folder else "every run compiles anew"
     return (
-        f"the cache folder {str(users_folder())!r} cannot be written "
-        f"({why_unwritable(users_folder())}), so {instead}; XDG_CACHE_HOME may name another."
+        f"the cache folder {str(users)!r} cannot be written ({why_unwritable(users)}), so {kept}; "
+        "XDG_CACHE_HOME may name another."
     )
 
 
@@ -122,12 +105,11 @@ def _temporary_folder() -> Path | None:
     """
     if not hasattr(os, "getuid"):  # a system without owners of folders
         return None
+    folder = Path(tempfile.gettempdir()) / f"jaxgran-{os.getuid()}"
     try:
-        folder = Path(tempfile.gettempdir()) / f"jaxgran-{os.getuid()}"
         folder.mkdir(mode=0o700, exist_ok=True)
         status = folder.lstat()
     except OSError:
         return None
-    shared = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    private = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not shared
-    return folder if private and not why_unwritable(folder) else None
+    private = stat.S_ISDIR(status.st_mode) and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return folder if private and status.st_uid == os.getuid() else None

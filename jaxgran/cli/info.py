@@ -45,7 +45,7 @@ def run_info_command(json: bool = False) -> None:
         "platform": f"{platform.system()} {platform.release()} {platform.machine()}",
         "processor": environment.processor(),
         "cores": f"{os.cpu_count()}, of which this process may use {environment.usable_cores()}",
-        "memory": environment.memory(),
+        "memory": _memory(),
         **_devices(),
         "precision": environment.precision(),
         "ffmpeg": shutil.which("ffmpeg") or "none",
@@ -92,6 +92,14 @@ def _caches() -> dict[str, Path | None]:
         "numba engine": object_file().parent,
         "figures": Path(matplotlib.get_cachedir()),
     }
+
+
+def _memory() -> str:
+    """Total memory in GiB, or "unknown"."""
+    try:
+        return f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB"
+    except (AttributeError, ValueError, OSError):
+        return "unknown"
 
 
 def _state(folder: Path | None) -> str:

@@ -18,12 +18,12 @@ from jaxgran.cli.outcome import (
     run_map,
     told_how_to_resume,
 )
-from jaxgran.cli.output import JSON, print_json, print_table, print_text
+from jaxgran.cli.output import JSON, in_brackets, print_json, print_table, print_text
 from jaxgran.cli.terminal import say, say_cache, say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.choices import HALF_INTERVAL, FileFormat
-from jaxgran.model.display import counted, in_brackets
+from jaxgran.model.display import counted
 
 MAP_EXAMPLES = {
     "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two "

@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxgran.maps.options import Option
+from jaxgran.model.display import with_error
 
 _BETWEEN = 3  # columns of the terminal between two columns of a table
 JSON = Option("Print one JSON object instead of tables.", bool)
@@ -42,6 +43,19 @@ _IN_ASCII = str.maketrans(
     }
     | {"–": "-", "−": "-", "×": "x", "…": "...", "’": "'"}
 )
+
+
+def in_brackets(value: float, error: float) -> str:
+    """A value with its standard error in units of the last digits.
+
+    Examples:
+      >>> in_brackets(1.2093, 0.0101), in_brackets(6.77, 0.23), in_brackets(58.7, 6.04)
+      ('1.209(10)', '6.77(23)', '59(6)')
+    """
+    text = with_error(value, error)
+    mean, _, half = text.partition(" ± ")
+    digits = half if half[:1] not in ("0", "") else half.replace(".", "").lstrip("0")
+    return text if "e" in text or not digits else f"{mean}({digits})"
 
 
 def _console() -> Console:

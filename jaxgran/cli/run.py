@@ -15,7 +15,8 @@ from jaxgran.cli.terminal import configured_jax, say, with_progress
 from jaxgran.io.paths import require_absent
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, at_most, require_number
-from jaxgran.model.display import counted, unit_text, with_error
+from jaxgran.model.display import counted, with_error
+from jaxgran.sampling.observables import unit_text
 
 MOST_RECORDED = 100_000  # frames of a trajectory
 _RECORDED_STRAIN = 5.0  # sampled strain where frames are recorded and none is given

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from jaxgran.cli.options import OVERWRITE, command
-from jaxgran.cli.output import JSON, Entry, print_json, print_table, print_text
+from jaxgran.cli.output import JSON, Entry, in_brackets, print_json, print_table, print_text
 from jaxgran.cli.terminal import say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError
-from jaxgran.model.display import in_brackets, with_error
+from jaxgran.model.display import with_error
 from jaxgran.reference.table import MEASURED, THEORIES, shipped_table
 from jaxgran.reference.validity import ASSUMPTIONS, COLUMNS, Validity, validity
 

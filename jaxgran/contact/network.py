@@ -9,18 +9,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.contact.compaction import bit_positions
 from jaxgran.contact.law import gap_coefficients, gap_discriminant, touching_time
-from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import relative_velocity
 from jaxgran.model.grains import Grains
 from jaxgran.model.indexing import taken
+from jaxgran.model.values import Value
 
 # In all over the number of grains: contacts of discs in a periodic cell form a graph on a torus
 MOST_CONTACTS = 3
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Contacts:
+@dataclass(frozen=True, eq=False, repr=False)
+class Contacts(Value):
     """The contact network of one step; unused slots have zero normals and zero inverse masses.
 
     ==============  =============  ====  ===========================================================
@@ -45,8 +44,6 @@ class Contacts:
     inverse_mass_i: Float[Array, " contacts"]
     inverse_mass_j: Float[Array, " contacts"]
     used: Bool[Array, " contacts"]
-
-    __eq__ = equal_values
 
 
 class PairMotion(NamedTuple):

@@ -19,17 +19,16 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import NetworkOperator
 from jaxgran.contact.network import Contacts
-from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import InputError, as_array, concrete_or_none, require, short_repr
+from jaxgran.model.values import Value
 
 LARGEST_FACTORED = 2048  # contacts of a matrix whose eigenvalues are checked, which takes 0.1 s
 _UNIT_LENGTH = 1e-5  # error of the length of a normal; float32 and typed digits pass
 _BATCH = "jax.vmap applies to a batch of problems, as jax.vmap(jaxgran.solve_contacts)"
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class ContactNetwork:
+@dataclass(frozen=True, eq=False, repr=False)
+class ContactNetwork(Value):
     """A contact problem given by its geometry: frictionless contacts of grains that do not rotate.
 
     ========  =============  ====  =================================================================
@@ -62,8 +61,6 @@ class ContactNetwork:
     masses: Float[Array, " grains"]
     approach: Float[Array, " contacts"]
 
-    __eq__ = equal_values
-
     def __post_init__(self) -> None:
         ends = np.asarray(self.ends) if isinstance(self.ends, (list, tuple)) else self.ends
         object.__setattr__(self, "ends", ends)
@@ -88,9 +85,8 @@ class ContactNetwork:
         return NetworkOperator(contacts, self.masses.size)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class DelassusProblem:
+@dataclass(frozen=True, eq=False, repr=False)
+class DelassusProblem(Value):
     """A contact problem given by its Delassus matrix, for any mechanical system without friction.
 
     ========  ====================  ====  ==========================================================
@@ -114,8 +110,6 @@ class DelassusProblem:
 
     matrix: Any
     approach: Float[Array, " contacts"]
-
-    __eq__ = equal_values
 
     def __post_init__(self) -> None:
         if hasattr(self.matrix, "tocoo"):  # a matrix of SciPy is no array for JAX

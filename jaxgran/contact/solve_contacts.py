@@ -23,16 +23,15 @@ from jaxgran.contact.projected_methods import (
     require_solver,
 )
 from jaxgran.contact.solver import natural_map, solve
-from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import as_array, require_number
 from jaxgran.model.flow import RANGES
+from jaxgran.model.values import Value
 
 _DEFAULT = BarzilaiBorwein(tolerance=1e-6)
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class ContactSolution:
+@dataclass(frozen=True, eq=False, repr=False)
+class ContactSolution(Value):
     """Impulses of a contact problem, and how good they are.
 
     ==========  ===========  ====  =================================================================
@@ -51,8 +50,6 @@ class ContactSolution:
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
     status: Int[Array, ""]
-
-    __eq__ = equal_values
 
 
 def solve_contacts(

@@ -6,24 +6,22 @@ dt.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.network import Contacts
-from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.cell import remap_tilt, wrap
-from jaxgran.model.display import are_numbers, text_of
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
+from jaxgran.model.values import Indexable
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Snapshot(Indexable):
     """A flow at the beginning of a time step, with the contacts of that step; a series has a
     leading (times,) axis.
@@ -49,23 +47,16 @@ class Snapshot(Indexable):
     restitution: Float[Array, "*times"]
     status: Int[Array, "*times"]
 
-    __eq__ = equal_values
-    _whole = "a series"
-
-    def __repr__(self) -> str:
-        numbers = self.impulses, self.status, self.timestep, self.shear_rate, self.restitution
-        if not are_numbers(*numbers) or np.ndim(self.impulses) < 1:
-            return text_of("Snapshot", {"state": self.state})
-        return text_of(
-            "Snapshot",
-            {
-                **({"times": len(self)} if self._axes else {}),
-                "grains": np.shape(self.state.positions)[-2],
-                "loaded_contacts": np.sum(np.asarray(self.impulses) > 0, axis=-1),
-                **{n: getattr(self, n) for n in ("timestep", "shear_rate", "restitution")},
-                "status": Status(int(np.max(self.status))).name,
-            },
-        )
+    def _shown(self) -> dict[str, Any]:
+        return {
+            **({"times": len(self)} if self._axes else {}),
+            "grains": np.shape(self.state.positions)[-2],
+            "loaded_contacts": np.sum(np.asarray(self.impulses) > 0, axis=-1),
+            "timestep": self.timestep,
+            "shear_rate": self.shear_rate,
+            "restitution": self.restitution,
+            "status": Status(int(np.max(self.status))).name,
+        }
 
     @property
     def _axes(self) -> tuple[int, ...]:

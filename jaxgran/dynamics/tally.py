@@ -17,9 +17,9 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.law import ContactTerms
-from jaxgran.model.batches import equal_values
 from jaxgran.model.indexing import taken
 from jaxgran.model.state import status_if_finite
+from jaxgran.model.values import Value
 
 # What adds to a sum. The running sums of an engine stand in this order, and within it in the order
 # of the table.
@@ -44,9 +44,8 @@ def _sum(
     )
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Tally:
+@dataclass(frozen=True, eq=False, repr=False)
+class Tally(Value):
     """Sums over the steps of a sample of one replica; ``+`` joins two samples.
 
     Averages, such as the pressure, also need the cell: ``sample`` returns them, with errors.
@@ -125,8 +124,6 @@ class Tally:
     )
     status: Int[Array, "*b"] = _sum(AT_END, "–", "status, the worst", joined="largest")
     observed: Any = None  # sums of what a user's function observes, a pytree; None without one
-
-    __eq__ = equal_values
 
     def __add__(self, other: "Tally") -> "Tally":
         return jax.tree.map(lambda *both: jnp.stack(both), self, other).total(axis=0)

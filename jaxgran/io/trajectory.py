@@ -44,7 +44,6 @@ from typing import Any
 
 import gsd.fl
 import gsd.hoomd
-import jax
 import numpy as np
 from jax.dtypes import canonicalize_dtype
 from jaxtyping import Float, Int
@@ -58,13 +57,13 @@ from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.dynamics.snapshots import snapshots_from
 from jaxgran.files import atomic_write, other_version
 from jaxgran.io.paths import require_place
-from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import centred, remap_tilt
 from jaxgran.model.checks import InputError, at_most, refused, require_number, short_repr
 from jaxgran.model.flow import ShearFlow, require_sheared, steps_of_strain
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State, require_state
 from jaxgran.model.status import MEANINGS, Status
+from jaxgran.model.values import Value
 
 FORMAT_VERSION = 2
 """Version of the chunks of jaxgran."""
@@ -72,9 +71,8 @@ FORMAT_VERSION = 2
 _SCHEMA_VERSION = [1, 4]  # gsd 5 writes 2.0 by default, which older versions of gsd reject
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, eq=False, repr=False)
+class Trajectory(Value):
     """States and parameters of a flow, read from the frames of a file.
 
     ================  =========  =====  ============================================================
@@ -103,8 +101,6 @@ class Trajectory:
     shear_rate: Float[np.ndarray, ""]
     restitution: Float[np.ndarray, ""]
     packing_fraction: Float[np.ndarray, ""]
-
-    __eq__ = equal_values
 
 
 def check_trajectory(path: Path) -> None:

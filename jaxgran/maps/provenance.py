@@ -2,12 +2,16 @@
 random numbers, and a hash of the sources.
 """
 
+import hashlib
 import os
 import platform
 from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import jax
 
 from jaxgran import environment
-from jaxgran.cache.persistent_jit import sources_digest
 
 _PACKAGES = ("jaxgran", "jax", "jaxlib", "jax-md", "numba", "numpy", "xarray")
 DECIDING = ("jaxgran", "jax", "jaxlib", "numba", "numpy")
@@ -20,16 +24,31 @@ def made_with() -> dict[str, str]:
     return {
         "precision": environment.precision(),
         "device": f"{device.platform}: {device.device_kind}",
-        "platform": f"{environment.system()}, {os.cpu_count()} cores",
+        "platform": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         "python": platform.python_version(),
         "commit": environment.commit(),
         "code_digest": sources_digest(),
-        "random_bits": environment.random_bits(),
+        "random_bits": random_bits(),
         **{
             f"version_{name.replace('-', '_')}": number
             for name, number in environment.versions(_PACKAGES).items()
         },
     }
+
+
+@cache
+def sources_digest() -> str:
+    """A hash of the sources of this package."""
+    digest, folder = hashlib.sha256(), Path(__file__).parents[1]
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def random_bits() -> str:
+    """The generator of random numbers, on whose flags in JAX the numbers depend."""
+    partitionable = jax.config.values["jax_threefry_partitionable"]
+    return "threefry2x32" if partitionable else "threefry2x32, not partitionable"
 
 
 def versions_of(made: Mapping[str, str]) -> dict[str, str]:

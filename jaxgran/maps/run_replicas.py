@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, UInt32
 
-from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.dynamics.batch import in_threads, replicas_of, stack
 from jaxgran.io.arrays import CorruptFile
 from jaxgran.maps.automatic import sampling_targets
@@ -157,7 +156,7 @@ def random_key(replica: ReplicaId) -> UInt32[Array, "2"]:
     return _folded_key(replica.seed, np.uint32(replica.checksum))
 
 
-@persistent_jit
+@jax.jit
 def _folded_key(seed: Array, number: Array) -> UInt32[Array, "2"]:
     numbers = jnp.stack([jnp.uint32(0), jnp.asarray(seed, jnp.uint32)])  # as of jax.random.key
     key = jax.random.wrap_key_data(numbers, impl="threefry2x32")

@@ -26,12 +26,8 @@ class InputError(ValueError):
         super().__init__(message)
         self.field, self.value, self.reason = field, value, reason
 
-    def __reduce__(self):  # errors of other processes are pickled
-        return _input_error, (str(self), self.field, self.reason)
-
-
-def _input_error(message: str, field: str, reason: str) -> InputError:
-    return InputError(message, field=field, reason=reason)
+    def __reduce__(self):  # errors of other processes are pickled, whatever the value is
+        return InputError, self.args, {"field": self.field, "reason": self.reason}
 
 
 def refused(field: str, value: Any, reason: str) -> InputError:
@@ -49,14 +45,14 @@ def concrete_or_none(value: Any) -> np.ndarray | None:
     if isinstance(value, (bool, int, float)):
         return np.asarray(value)
     import jax  # here, so that the command line checks its options without it
-    from jax.core import Tracer
 
-    if isinstance(value, Tracer):
+    if is_traced(value):
         return None
-    key = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
-    number = isinstance(value, (np.generic, np.ndarray, jax.Array)) and not key
-    number = number and not isinstance(value, np.ma.MaskedArray)  # its mask would be ignored
-    array = np.asarray(value if number else None)
+    known = isinstance(value, (np.generic, np.ndarray, jax.Array))
+    if not known or isinstance(value, np.ma.MaskedArray):  # whose mask would be ignored
+        return np.asarray(None)
+    is_key = jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
+    array = np.asarray(None if is_key else value)
     is_small = array.dtype.kind == "V" and jax.numpy.issubdtype(array.dtype, np.floating)
     return array.astype(np.float32) if is_small else array  # such as bfloat16
 
@@ -84,8 +80,8 @@ def at_most(value: Any, limit: Any, rounding: float = _ROUNDING) -> Any:
 
 
 _SHORT_REPR = Repr()
-_FEW = 100  # numbers of an array that is quoted as a list
 _SHORT_REPR.maxother = _SHORT_REPR.maxstring = 100
+_FEW = 100  # numbers of an array that is quoted as a list
 
 
 def short_repr(value: Any) -> str:
@@ -118,28 +114,36 @@ def require(name: str, value: Any, accepts: Callable, accepted: str) -> None:
 
 
 def as_array(values: Any) -> Any:
-    """A list or tuple of numbers, or of equally long ones, as an array of floats; an array in the
-    byte order of this machine; any other value unchanged.
+    """A list or tuple of numbers, or of equally long ones, as an array of floats; a number or an
+    array of another library as one of Python or NumPy, in the byte order of this machine, which
+    compiled functions require; any other value, such as a masked array, unchanged.
 
     Examples:
       >>> as_array([[1, 0], (0, 1)]).tolist(), as_array(["a"])
       ([[1.0, 0.0], [0.0, 1.0]], ['a'])
     """
-    if isinstance(values, np.ndarray):  # compiled functions of JAX misread another byte order
+    if isinstance(values, np.ndarray):
         return values.astype(values.dtype.newbyteorder("="), copy=False)
-    if not isinstance(values, (list, tuple)):
-        return _as_number(values)
-    if any(isinstance(x, (list, tuple)) for x in values):
-        rows = [as_array(x) for x in values]
-        alike = all(isinstance(x, np.ndarray) and x.shape == np.shape(rows[0]) for x in rows)
-        return np.stack(rows) if alike else values
-    numbers = all(
-        isinstance(x, (int, float, np.integer, np.floating))
-        and not isinstance(x, bool)
-        and abs(x) < 1e300
-        for x in values
-    )
-    return np.asarray(values, float) if numbers else values
+    if isinstance(values, (Decimal, Fraction)):
+        return float(values)
+    listed = isinstance(values, (list, tuple))
+    if listed and not _are_numbers(values):
+        return values
+    foreign = hasattr(values, "__array__") and not isinstance(values, np.generic)
+    if listed or (foreign and type(values).__module__[:3] != "jax" and not is_traced(values)):
+        with suppress(TypeError, ValueError):  # such as a Dataset, and lists of several lengths
+            array = np.asarray(values)
+            if array.dtype.kind in "iuf":
+                return array.astype(float) if listed else array
+    return values
+
+
+def _are_numbers(values: Any) -> bool:
+    """Whether this is a number, or nested lists hold nothing but numbers."""
+    if isinstance(values, (list, tuple)):
+        return all(map(_are_numbers, values))
+    number = isinstance(values, (int, float, np.integer, np.floating))
+    return number and not isinstance(values, bool)
 
 
 def require_native(name: str, tree: Any) -> None:
@@ -151,21 +155,6 @@ def require_native(name: str, tree: Any) -> None:
             f"{name} must have the byte order of this machine: "
             f"jax.tree.map(lambda x: x.astype(float), {name}) gives it."
         )
-
-
-def _as_number(value: Any) -> Any:
-    """A number or an array of another library as one of Python or NumPy; anything else unchanged,
-    as are masked arrays.
-    """
-    if isinstance(value, (Decimal, Fraction)):
-        return float(value)
-    known = isinstance(value, (np.ndarray, np.generic)) or type(value).__module__[:3] == "jax"
-    if known or not hasattr(value, "__array__") or is_traced(value):
-        return value
-    with suppress(TypeError, ValueError):  # such as a Dataset, which is no array
-        array = np.asarray(value)
-        return array if array.dtype.kind in "iuf" else value
-    return value
 
 
 def require_number(name: str, value: Any, accepts: Callable, accepted: str) -> None:
@@ -227,9 +216,5 @@ def key_shape(key: Any) -> tuple[int, ...] | None:
 
     if isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key):
         return key.shape
-    raw = (
-        isinstance(key, (jax.Array, np.ndarray))
-        and key.dtype == np.uint32
-        and key.shape[-1:] == (2,)
-    )
-    return key.shape[:-1] if raw else None
+    known = isinstance(key, (jax.Array, np.ndarray)) and key.dtype == np.uint32
+    return key.shape[:-1] if known and key.shape[-1:] == (2,) else None

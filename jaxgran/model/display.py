@@ -6,7 +6,7 @@ no more space than one. A traced value is shown by its type.
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,17 +17,23 @@ _TWO_DIGITS = 3.55  # an error that begins with less has two digits
 _SMALLEST_PLAIN, _LARGEST_ROUNDED, _LARGEST_PLAIN = -4, 5, 9
 
 
-def text_of(title: str, values: Mapping[str, Any], errors: Mapping[str, Any] | None = None) -> str:
+class WithError(NamedTuple):
+    """A value and its error, as ``text_of`` shows them; many values without their errors."""
+
+    value: Any
+    error: Any
+
+
+def text_of(title: str, values: Mapping[str, Any]) -> str:
     """One line: the title, then ``name=value`` of each value in brackets.
 
-    A single number is shown with its error, if known. Many numbers are shown by shape and range.
-    Any other value is shown by its ``repr``.
+    Many numbers are shown by shape and range. What is no number is shown by its ``repr``.
     """
-    texts = (f"{name}={_text(value, (errors or {}).get(name))}" for name, value in values.items())
-    return f"{title}({', '.join(texts)})"
+    return f"{title}({', '.join(f'{name}={_text(value)}' for name, value in values.items())})"
 
 
-def _text(value: Any, error: Any) -> str:
+def _text(value: Any) -> str:
+    value, error = value if isinstance(value, WithError) else (value, None)
     numbers = _numbers(value)
     if numbers is None:
         words = " ".join(repr(value).split())
@@ -44,15 +50,15 @@ def _text(value: Any, error: Any) -> str:
     return f"<{shape} values, {spread}{lost}>"
 
 
-def counted(number: int, noun: str) -> str:
-    """A number of things.
-
-    Examples:
-      >>> counted(1, "point"), counted(0, "batch")
-      ('1 point', '0 batches')
-    """
-    ending = "" if number == 1 else "es" if noun.endswith("ch") else "s"
-    return f"{number} {noun}{ending}"
+def _numbers(value: Any) -> np.ndarray | None:
+    """The value as an array of numbers; None if it is not numeric, or traced."""
+    if isinstance(value, (bool, str, bytes)) or value is None:
+        return None
+    try:
+        array = np.asarray(value)
+    except Exception:  # JAX raises for a traced value, NumPy for a value that is no array
+        return None
+    return array if array.dtype.kind in "iuf" else None
 
 
 def with_error(value: float, error: float) -> str:
@@ -78,46 +84,6 @@ def with_error(value: float, error: float) -> str:
     return f"({text})e{shared:+03d}" if shared else text
 
 
-def in_brackets(value: float, error: float) -> str:
-    """A value with its standard error in units of the last digits.
-
-    Examples:
-      >>> in_brackets(1.2093, 0.0101), in_brackets(6.77, 0.23), in_brackets(58.7, 6.04)
-      ('1.209(10)', '6.77(23)', '59(6)')
-    """
-    text = with_error(value, error)
-    mean, _, half = text.partition(" ± ")
-    digits = half if half[:1] not in ("0", "") else half.replace(".", "").lstrip("0")
-    return text if "e" in text or not digits else f"{mean}({digits})"
-
-
-def unit_text(unit: str) -> str:
-    """A unit of the tables with its signs, such as ``mσ²/t²`` for ``m sigma^2 / t^2``; nothing for
-    a pure number.
-    """
-    for word, sign in (
-        ("shear rate", "γ̇"),
-        ("m sigma", "mσ"),
-        ("sigma", "σ"),
-        ("^2", "²"),
-        ("^3", "³"),
-        (" / ", "/"),
-    ):
-        unit = unit.replace(word, sign)
-    return "" if unit == "1" else unit
-
-
-def _numbers(value: Any) -> np.ndarray | None:
-    """The value as an array of numbers; None if it is not numeric, or traced."""
-    if isinstance(value, (bool, str, bytes)) or value is None:
-        return None
-    try:
-        array = np.asarray(value)
-    except Exception:  # JAX raises for a traced value, NumPy for a value that is no array
-        return None
-    return array if array.dtype.kind in "iuf" else None
-
-
 def rounded(value: Any) -> Any:
     """A single measured number to six digits; an array unchanged."""
     return float(f"{float(value):.6g}") if np.ndim(value) == 0 else value
@@ -128,6 +94,12 @@ def to_two_digits(value: float) -> str:
     return f"{float(f'{value:.2g}'):g}"
 
 
-def are_numbers(*leaves: Any) -> bool:
-    """Whether all leaves are numeric, and none is traced."""
-    return all(_numbers(leaf) is not None for leaf in leaves)
+def counted(number: int, noun: str) -> str:
+    """A number of things.
+
+    Examples:
+      >>> counted(1, "point"), counted(0, "batch")
+      ('1 point', '0 batches')
+    """
+    ending = "" if number == 1 else "es" if noun.endswith("ch") else "s"
+    return f"{number} {noun}{ending}"

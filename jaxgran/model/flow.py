@@ -1,7 +1,6 @@
 """ShearFlow: the parameters of one simple shear flow, with their units and accepted ranges."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -11,7 +10,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.checks import (
     InputError,
     as_array,
@@ -29,7 +27,7 @@ from jaxgran.model.choices import (
     MAX_STEPS,
     MIN_GRAINS,
 )
-from jaxgran.model.display import text_of
+from jaxgran.model.values import Indexable
 
 _FASTEST = 1e100  # shear rate; the square and cube of it and of its inverse are finite in float64
 _THETA = {"midpoint": 0.5, "touching": 0.0}  # of the activation rules
@@ -50,7 +48,7 @@ RANGES = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class ShearFlow(Indexable):
     """Parameters of a simple shear flow of rigid, frictionless, polydisperse discs.
 
@@ -96,90 +94,49 @@ class ShearFlow(Indexable):
     polydispersity: float | jax.Array = 0.26
     activation: Any = "midpoint"
 
-    __eq__ = equal_values
-
-    def __hash__(self) -> int:
-        leaves, structure = jax.tree.flatten(self)
-        return hash((structure, *leaves))
-
-    def __repr__(self) -> str:
-        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        if isinstance(self.activation, float):
-            rules = {theta: rule for rule, theta in _THETA.items()}
-            values["activation"] = rules.get(self.activation, self.activation)
-        return text_of("ShearFlow", values)
-
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require_whole("grains", self.grains, MIN_GRAINS, MAX_GRAINS, "as memory is limited")
-        if isinstance(self.activation, str):
-            object.__setattr__(self, "activation", _THETA.get(self.activation, self.activation))
+        theta = _THETA.get(self.activation) if isinstance(self.activation, str) else None
+        numbers = {name: as_array(getattr(self, name)) for name in RANGES}
+        numbers |= {} if theta is None else {"activation": theta}
         for name, (accepts, words) in RANGES.items():
-            object.__setattr__(self, name, as_array(getattr(self, name)))
-            require(name, getattr(self, name), accepts, words)
-        shapes = sorted({np.shape(getattr(self, name)) for name in _TRACED_FIELDS} - {()})
+            require(name, numbers[name], accepts, words)
+        shapes = sorted({*map(np.shape, numbers.values())} - {()})
         if len(shapes) > 1:
             raise InputError(
                 "the numbers of a batch of flows must be arrays of one shape, not "
                 f"{short_repr(shapes)}."
             )
-        timestep, shear_rate = concrete_or_none(self.timestep), concrete_or_none(self.shear_rate)
-        with np.errstate(over="ignore"):
-            too_long = (
-                timestep is not None
-                and shear_rate is not None
-                and np.any(timestep * shear_rate > 0.1)
-            )
-        if too_long:
-            raise InputError(
-                f"timestep must be at most 0.1 / shear_rate, not {short_repr(self.timestep)}."
-            )
-        if shapes:
-            _broadcast(self, shapes[0])
+        timestep, shear_rate = (concrete_or_none(numbers[x]) for x in ("timestep", "shear_rate"))
+        if timestep is not None and shear_rate is not None:
+            with np.errstate(over="ignore"):
+                too_long = np.any(timestep * shear_rate > 0.1)
+            if too_long:
+                raise InputError(
+                    f"timestep must be at most 0.1 / shear_rate, not {short_repr(self.timestep)}."
+                )
+        for name, value in numbers.items():
+            object.__setattr__(self, name, _repeated(value, shapes[0]) if shapes else value)
 
     @property
     def _axes(self) -> tuple[int, ...]:
         return np.shape(self.restitution)
 
+    def _shown(self) -> dict[str, Any]:
+        rules = {theta: rule for rule, theta in _THETA.items()}
+        named = {"activation": rules[self.activation]} if np.ndim(self.activation) == 0 else {}
+        return super()._shown() | named
 
-_TRACED_FIELDS = tuple(f.name for f in fields(ShearFlow) if not f.metadata.get("static"))
-_STATIC_FIELDS = tuple(f.name for f in fields(ShearFlow) if f.metadata.get("static"))
 
-
-def _broadcast(flow: ShearFlow, shape: tuple[int, ...]) -> None:
-    """Give every number of a batch its axis of replicas, in JAX's default precision: that of
-    another number may be too low for it.
+def _repeated(value: Any, shape: tuple[int, ...]) -> Any:
+    """A number of a batch with the axis of replicas, in JAX's default precision: that of another
+    number may be too low for it.
     """
-    numbers = {name: getattr(flow, name) for name in _TRACED_FIELDS}
-    kind = jnp.result_type(float)
-    for name, value in numbers.items():
-        if np.ndim(value) == 0:
-            traced = isinstance(value, Tracer)
-            repeated = (
-                jnp.broadcast_to(value, shape)
-                if traced
-                else np.broadcast_to(np.asarray(value, kind), shape)
-            )
-            object.__setattr__(flow, name, repeated)
-
-
-def _unflatten(static: tuple, traced: Iterable) -> ShearFlow:
-    """A flow of any leaves, without checks: JAX also passes derivatives, axis numbers and
-    placeholders.
-    """
-    flow = object.__new__(ShearFlow)
-    for name, value in zip(_STATIC_FIELDS + _TRACED_FIELDS, (*static, *traced), strict=True):
-        object.__setattr__(flow, name, value)
-    return flow
-
-
-jax.tree_util.register_pytree_with_keys(
-    ShearFlow,
-    lambda flow: (
-        [(jax.tree_util.GetAttrKey(name), getattr(flow, name)) for name in _TRACED_FIELDS],
-        tuple(getattr(flow, name) for name in _STATIC_FIELDS),
-    ),
-    _unflatten,
-)
+    if np.ndim(value):
+        return value
+    if isinstance(value, Tracer):
+        return jnp.broadcast_to(value, shape)
+    return np.broadcast_to(np.asarray(value, jnp.result_type(float)), shape)
 
 
 def in_dtype(numbers: Any, dtype: Any) -> Any:
@@ -202,15 +159,9 @@ def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:
     if not is_traced(strain, flow.shear_rate, flow.timestep):
         step = float(np.asarray(flow.shear_rate) * np.asarray(flow.timestep))
         least, most = parts * step, MAX_STEPS * step
-        require(
-            "strain", strain, lambda x: x >= 0.99 * least, f"at least {parts} time steps, {least:g}"
-        )
-        require(
-            "strain",
-            strain,
-            lambda x: x <= most,
-            f"at most {MAX_STEPS} time steps, {two_digits(most, up=False)}",
-        )
+        few, many = f"at least {parts} time steps, {least:g}", f"at most {MAX_STEPS} time steps, "
+        require("strain", strain, lambda x: x >= 0.99 * least, few)
+        require("strain", strain, lambda x: x <= most, many + two_digits(most, up=False))
 
 
 def steps_of_strain(flow: ShearFlow, strain: Any) -> Any:
@@ -252,8 +203,7 @@ def flow_of_replica(flow: Any, k: int, count: int) -> ShearFlow:
     """Flow ``k`` of a batch of ``count``, whose numbers are single ones, the same for all, or
     arrays of ``count``.
     """
-    _require_flows(flow)
-    shapes = {np.shape(getattr(flow, name)) for name in _TRACED_FIELDS} - {()}
+    shapes = _shapes_of(flow)
     if shapes - {(count,)}:
         raise InputError(
             f"numbers of the flow must be single ones or arrays ({count},), one for each key, not "
@@ -262,18 +212,28 @@ def flow_of_replica(flow: Any, k: int, count: int) -> ShearFlow:
     return jax.tree.map(lambda x: np.broadcast_to(x, (count,))[k], flow)
 
 
-def _require_flows(flow: Any) -> None:
+def require_flow(flow: Any) -> None:
+    """Raise an InputError unless this is a single ShearFlow, not a batch."""
+    if _shapes_of(flow):
+        raise InputError(
+            "flow must be one ShearFlow, and this is a batch: use jax.vmap or jax.lax.map."
+        )
+
+
+def _shapes_of(flow: Any) -> set[tuple[int, ...]]:
+    """The shapes of the arrays of a flow; none for a single one. InputError for anything else."""
     if not isinstance(flow, ShearFlow):
         raise InputError(f"flow must be a ShearFlow, not {short_repr(flow)}.")
+    return {*map(np.shape, jax.tree.leaves(flow))} - {()}
 
 
 @jax.custom_jvp
-def _of_state(packing_fraction: Array) -> Array:
-    """A packing fraction that a state has."""
+def _not_differentiable(packing_fraction: Array) -> Array:
+    """The same packing fraction, with respect to which JAX cannot differentiate."""
     return packing_fraction
 
 
-@partial(_of_state.defjvp, symbolic_zeros=True)
+@partial(_not_differentiable.defjvp, symbolic_zeros=True)
 def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     if not isinstance(tangents[0], jax.custom_derivatives.SymbolicZero):
         raise InputError(
@@ -290,23 +250,6 @@ def flow_of_state(flow: ShearFlow) -> ShearFlow:
     """
     if not is_traced(flow.packing_fraction):
         return flow
-    numbers = {name: getattr(flow, name) for name in _TRACED_FIELDS}
     # A copy: JAX refuses a batch of NumPy numbers, over which vmap maps, in a custom derivative.
-    numbers["packing_fraction"] = _of_state(jnp.array(flow.packing_fraction))
-    return _unflatten((flow.grains,), numbers.values())
-
-
-def is_batch(flow: Any) -> bool:
-    """Whether this is a ShearFlow whose numbers have an axis of replicas."""
-    return isinstance(flow, ShearFlow) and any(
-        np.ndim(getattr(flow, name)) for name in _TRACED_FIELDS
-    )
-
-
-def require_flow(flow: Any) -> None:
-    """Raise an InputError unless this is a single ShearFlow, not a batch."""
-    _require_flows(flow)
-    if is_batch(flow):
-        raise InputError(
-            "flow must be one ShearFlow, and this is a batch: use jax.vmap or jax.lax.map."
-        )
+    packing_fraction = jnp.copy(flow.packing_fraction)
+    return replace(flow, packing_fraction=_not_differentiable(packing_fraction))

@@ -10,7 +10,6 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import (
     InputError,
     as_array,
@@ -22,17 +21,15 @@ from jaxgran.model.checks import (
     short_repr,
 )
 from jaxgran.model.choices import MAX_GRAINS
+from jaxgran.model.values import Value
 
 _POSITIVE = "a list of positive numbers"
 _LARGEST_VALUE = 1e30  # of a diameter or a mass; their sums stay finite in float32
-_MEAN_DIAMETER_TOLERANCE = (
-    1e-3  # σ; allowed difference between the mean of given diameters and the unit of length
-)
+_MEAN_DIAMETER_TOLERANCE = 1e-3  # σ
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Grains:
+@dataclass(frozen=True, eq=False, repr=False)
+class Grains(Value):
     """The discs of one replica.
 
     ======  ===========  ====  =======
@@ -45,8 +42,6 @@ class Grains:
 
     radii: Float[Array, " grains"]
     masses: Float[Array, " grains"]
-
-    __eq__ = equal_values
 
 
 def polydisperse(count: int, polydispersity: float | Array, key: Array) -> Grains:
@@ -94,15 +89,15 @@ def own_grains(diameters: ArrayLike, masses: ArrayLike | None = None) -> Grains:
     Raises:
       InputError: these are not two lists of positive numbers of the same length.
     """
-    given = {
-        "diameters": as_array(diameters),
-        **({} if masses is None else {"masses": as_array(masses)}),
-    }
-    for name, values in given.items():
-        require(name, values, lambda x: (x.ndim == 1) & (x > 0) & (x < _LARGEST_VALUE), _POSITIVE)
-    sizes = jnp.asarray(given["diameters"], float)
-    sizes = sizes / jnp.mean(sizes)
-    weights = sizes**2 if masses is None else jnp.asarray(given["masses"], float)
+
+    def positive(name: str, values: Any) -> Array:
+        numbers = as_array(values)
+        require(name, numbers, lambda x: (x.ndim == 1) & (x > 0) & (x < _LARGEST_VALUE), _POSITIVE)
+        return jnp.asarray(numbers, float)
+
+    lengths = positive("diameters", diameters)
+    sizes = lengths / jnp.mean(lengths)
+    weights = sizes**2 if masses is None else positive("masses", masses)
     if weights.shape != sizes.shape:
         raise InputError(
             f"there must be as many masses as diameters, and there are {weights.size} and "

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import jax
@@ -11,22 +11,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxgran.model.batches import Indexable, equal_values, in_numpy
 from jaxgran.model.checks import InputError, concrete_or_none, require_native
-from jaxgran.model.display import are_numbers, rounded, text_of
+from jaxgran.model.display import rounded
 from jaxgran.model.flow import ShearFlow, require_flow
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import Status
+from jaxgran.model.values import Indexable, in_numpy
 
 _ROUNDING = 1e-5  # of a packing fraction in float32, with some room
-_ACCEPTED = {
-    **dict.fromkeys(("radii", "masses", "side"), lambda x: (x > 0) & np.isfinite(x)),
-    **dict.fromkeys(("positions", "velocities", "tilt"), np.isfinite),
-}
+_POSITIVE = ("radii", "masses", "side")
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class State(Indexable):
     """A sheared packing at one instant.
 
@@ -47,28 +43,17 @@ class State(Indexable):
     side: Float[Array, ""]
     tilt: Float[Array, ""]
 
-    __eq__ = equal_values
-
-    def __repr__(self) -> str:
-        cell = {"side": self.side, "tilt": self.tilt}
-        numbers = self.grains.radii, self.grains.masses, self.velocities, *cell.values()
-        if not are_numbers(*numbers) or np.ndim(self.velocities) < 2:
-            return text_of("State", {"positions": self.positions, **cell})
+    def _shown(self) -> dict[str, Any]:
         *replicas, grains, _ = np.shape(self.velocities)
-        values = {
-            "packing_fraction": self.packing_fraction,
-            "granular_temperature": self.granular_temperature,
-            **cell,
+        return {
+            **({"replicas": math.prod(replicas)} if replicas else {}),
+            "grains": grains,
+            "packing_fraction": rounded(self.packing_fraction),
+            "granular_temperature": rounded(self.granular_temperature),
+            "side": rounded(self.side),
+            "tilt": rounded(self.tilt),
+            "precision": str(self.velocities.dtype),
         }
-        return text_of(
-            "State",
-            {
-                **({"replicas": math.prod(replicas)} if replicas else {}),
-                "grains": grains,
-                **{name: rounded(value) for name, value in values.items()},
-                "precision": str(self.velocities.dtype),
-            },
-        )
 
     def without_momentum(self) -> Self:
         """The same state seen from its centre of mass, as ``sample`` requires it; also of a batch.
@@ -123,15 +108,15 @@ def require_state(flow: ShearFlow, state: State) -> None:
             f"state must be one State of {flow.grains} grains, best from prepare, not "
             f"{type(state).__name__}."
         )
-    arrays = {"radii": state.grains.radii, "masses": state.grains.masses}
-    arrays |= {f.name: getattr(state, f.name) for f in fields(state) if f.name != "grains"}
+    arrays = {**vars(state.grains), **vars(state)}
+    del arrays["grains"]
     _require_arrays(flow.grains, arrays)
     known = {name: concrete_or_none(x) for name, x in arrays.items()}
     for name, numbers in known.items():
-        if numbers is not None and not np.all(_ACCEPTED[name](numbers)):
-            positive = "" if _ACCEPTED[name] is np.isfinite else "positive and "
-            raise InputError(f"state must have only {positive}finite {name}, best from prepare.")
-    radii, side = known["radii"], known["side"]
+        least, words = (0, "positive and finite") if name in _POSITIVE else (-np.inf, "finite")
+        if numbers is not None and not np.all((numbers > least) & np.isfinite(numbers)):
+            raise InputError(f"state must have only {words} {name}, best from prepare.")
+    radii, positions, side, tilt = (known[x] for x in ("radii", "positions", "side", "tilt"))
     if radii is None or side is None:
         return
     if (nu := concrete_or_none(flow.packing_fraction)) is not None:
@@ -141,16 +126,15 @@ def require_state(flow: ShearFlow, state: State) -> None:
                 f"packing_fraction must be {of_state:.6g}, which the state has, not {nu:g}: a flow "
                 "with another one begins with a state of its own, from prepare."
             )
-    if known["positions"] is not None and known["tilt"] is not None:
-        _require_apart(radii, known["positions"], float(side), float(known["tilt"]))
+    if positions is not None and tilt is not None:
+        _require_apart(radii, positions, float(side), float(tilt))
 
 
 def _require_arrays(grains: int, arrays: dict[str, Any]) -> None:
     """Raise an InputError unless the arrays have the shapes of a state, and one precision."""
+    vectors, numbers = ("positions", "velocities"), ("side", "tilt")
     for name, x in arrays.items():
-        shape = {"positions": (grains, 2), "velocities": (grains, 2), "side": (), "tilt": ()}.get(
-            name, (grains,)
-        )
+        shape = (grains, 2) if name in vectors else () if name in numbers else (grains,)
         if np.shape(x) != shape:
             raise InputError(
                 f"state must be one State of {grains} grains, best from prepare, of {name} "
@@ -200,9 +184,7 @@ def kinetic_energy(grains: Grains, velocities: Array) -> Float[Array, ""]:
 def relative_momentum(grains: Grains, velocities: Array) -> Float[Array, ""]:
     """Total momentum over the sum of the momenta of the grains, |Σ m c| / Σ m |c|; zero at rest."""
     momenta = grains.masses[:, None] * velocities
-    momenta = lax.stop_gradient(
-        momenta
-    )  # it measures rounding, and a norm has no derivative at rest
+    momenta = lax.stop_gradient(momenta)  # rounding, and a norm has no derivative at rest
     scale = jnp.sum(jnp.linalg.norm(momenta, axis=-1))
     return jnp.linalg.norm(jnp.sum(momenta, axis=0)) / jnp.where(scale > 0, scale, 1)
 

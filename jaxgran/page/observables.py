@@ -11,11 +11,12 @@ from matplotlib.ticker import MaxNLocator
 
 from jaxgran.maps.schema import FINEST, TENSOR_AXES, path_of
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.model.display import unit_text, with_error
+from jaxgran.model.display import with_error
 from jaxgran.plotting.encoding import EXCESS_LEVELS
 from jaxgran.plotting.plane import contour_variable, interpolated, refined_axes
 from jaxgran.plotting.selection import is_plane
 from jaxgran.plotting.style import ROUND_STEPS, log_locator
+from jaxgran.sampling.observables import unit_text
 
 AXES = {
     "grains": "Grains N",

@@ -15,7 +15,7 @@ import jaxgran
 from jaxgran.files import atomic_write
 from jaxgran.io.paths import require_absent
 from jaxgran.model.checks import as_array, require
-from jaxgran.model.display import text_of
+from jaxgran.model.display import WithError, text_of
 from jaxgran.reference.evaluation import PLANE, estimates, module_of, over_range
 from jaxgran.reference.table import LENGTH, MEASURED, Table, shipped_table, write_columns
 
@@ -82,8 +82,10 @@ class Rheology(NamedTuple):
     def __repr__(self) -> str:
         """The averages, with ± half-widths of 95 % intervals."""
         values = self._asdict()
-        averages = {name: x for name, x in values.items() if not name.endswith("_ci95")}
-        return text_of("Rheology", averages, {name: values[f"{name}_ci95"] for name in averages})
+        averages = [name for name in values if not name.endswith("_ci95")]
+        return text_of(
+            "Rheology", {name: WithError(values[name], values[f"{name}_ci95"]) for name in averages}
+        )
 
 
 @register_static

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.model.display import text_of, to_two_digits, with_error
+from jaxgran.model.display import WithError, text_of, to_two_digits, with_error
 from jaxgran.reference.evaluation import estimates, over_range
 from jaxgran.reference.table import (
     CORRECTED,
@@ -83,7 +83,10 @@ class Validity(NamedTuple):
     def __repr__(self) -> str:
         """Where it is, and the measured averages with ± half-widths of 95 % intervals."""
         where = {"restitution": self.restitution, "packing_fraction": self.packing_fraction}
-        return text_of("Validity", where | self.measured, self.measured_ci95)
+        measured = {
+            name: WithError(x, self.measured_ci95[name]) for name, x in self.measured.items()
+        }
+        return text_of("Validity", where | measured)
 
     def fails_first(self) -> Any:
         """The name of the factor that is furthest from one, in logarithm; "none" where all are

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.batches import in_numpy
+from jaxgran.model.values import in_numpy
 from jaxgran.sampling.observables import OBSERVABLES
 
 

@@ -49,7 +49,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
@@ -188,7 +187,7 @@ def _enskog(
     )
 
 
-@persistent_jit
+@jax.jit
 def _collisional_transfer(
     tensors: Float[Array, "tensors 2 2"], classes: Any, *numbers: Array
 ) -> Collisions:

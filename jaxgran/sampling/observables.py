@@ -231,3 +231,19 @@ def unit_attributes(unit: str) -> dict[str, str]:
     and t.
     """
     return {"units": "1"} if unit == "1" else {"reduced_unit": unit, "units": "1"}
+
+
+def unit_text(unit: str) -> str:
+    """A unit of the tables with its signs, such as ``mσ²/t²`` for ``m sigma^2 / t^2``; nothing for
+    a pure number.
+    """
+    for word, sign in (
+        ("shear rate", "γ̇"),
+        ("m sigma", "mσ"),
+        ("sigma", "σ"),
+        ("^2", "²"),
+        ("^3", "³"),
+        (" / ", "/"),
+    ):
+        unit = unit.replace(word, sign)
+    return "" if unit == "1" else unit

@@ -12,12 +12,12 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxgran.dynamics.tally import TABLE, Tally
-from jaxgran.model.batches import Indexable, equal_values, in_numpy
+from jaxgran.dynamics.tally import Tally
 from jaxgran.model.checks import InputError, is_traced, require_untraced
-from jaxgran.model.display import are_numbers, rounded, text_of
+from jaxgran.model.display import WithError, rounded
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import LARGEST_DRIFT, Status, worse
+from jaxgran.model.values import Indexable, in_numpy
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.correlation_strain import flow_correlation_strain, mass_of_grains
 from jaxgran.sampling.observables import OBSERVABLES, Observables
@@ -66,8 +66,7 @@ def _computed_once(compute: Callable[["Sample"], T]) -> T:
     return property(value)  # type: ignore[return-value]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Sample(Observables, Indexable):
     """A measured strain of one replica; a batch has a leading (replicas,) axis everywhere.
 
@@ -94,29 +93,18 @@ class Sample(Observables, Indexable):
     flow: ShearFlow
     engine: str = field(default="", metadata={"static": True})
 
-    __eq__ = equal_values
-
-    def __repr__(self) -> str:
-        numbers = [getattr(self.tally, name) for name in TABLE]
-        if (
-            not are_numbers(*numbers, self.area, *jax.tree.leaves(self.flow))
-            or np.ndim(self.tally.contact_moment) < 3
-        ):
-            return text_of("Sample", {"grains": self.flow.grains, "area": self.area})
-        single, averages, status = not self._axes, self.averages, np.asarray(self.status)
+    def _shown(self) -> dict[str, Any]:
+        single, status = not self._axes, np.asarray(self.status)
+        averages, errors = self.averages, self.errors() if single else {}
         counts = Counter(Status(int(code)).name for code in status.flat).most_common()
         names = (name if single else f"{name} ({count})" for name, count in counts)
-        return text_of(
-            "Sample",
-            {
-                **({} if single else {"replicas": status.size}),
-                "grains": self.flow.grains,
-                "strain": rounded(self.strain),
-                **{name: averages[name] for name in _SHOWN},
-                "status": ", ".join(names),
-            },
-            self.errors() if single else None,
-        )
+        return {
+            **({} if single else {"replicas": status.size}),
+            "grains": self.flow.grains,
+            "strain": rounded(self.strain),
+            **{name: WithError(averages[name], errors.get(name)) for name in _SHOWN},
+            "status": ", ".join(names),
+        }
 
     @property
     def _axes(self) -> tuple[int, ...]:
