@@ -66,17 +66,6 @@ def test_replicas_of_a_vmap_have_the_bits_of_each_alone(name: str, states) -> No
             assert_same(replica(batch, k), alone)
 
 
-@pytest.mark.parametrize("name", ENGINES)
-def test_flows_of_numpy_may_be_constants_of_a_compiled_vmap(name: str, states) -> None:
-    flows = replace(flow_of(0.7), restitution=np.asarray(ALPHAS))
-
-    def run(flows: jg.ShearFlow, states: jg.State) -> tuple:
-        return jax.vmap(lambda *one: advance(*one, STEPS, engine=ENGINES[name]))(flows, states)
-
-    constant, given = jax.jit(partial(run, flows))(states), jax.jit(run)(flows, states)
-    np.testing.assert_allclose(constant[0].velocities, given[0].velocities, atol=1e-12)
-
-
 def test_replicas_of_a_vmap_advance_one_after_another(states) -> None:
     """With loops and conditions of their own, which an axis of replicas would turn into choices
     between branches.
