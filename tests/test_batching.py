@@ -250,12 +250,11 @@ def test_states_that_share_a_flow_advance_with_conditions_of_their_own(states) -
 
 @pytest.mark.parametrize("name", ENGINES)
 def test_a_compiled_function_closes_over_flows_of_numpy(name: str, states) -> None:
-    flows = jax.tree.map(np.asarray, stacked([flow_of(0.7)] * 3))
+    flows, steps = jax.tree.map(np.asarray, stacked([flow_of(0.7)] * 3)), np.array([5, 9, STEPS])
 
     def ends(states):
-        return jax.vmap(lambda f, s: advance(f, s, jnp.int32(STEPS), engine=ENGINES[name]))(
-            flows, states
-        )
+        run = partial(advance, engine=ENGINES[name])
+        return jax.vmap(run)(flows, states, steps)
 
     alone = compiled(lambda s: advance(flow_of(0.7), s, jnp.int32(STEPS), engine=ENGINES[name]))
     assert_same(replica(compiled(ends)(states), 2), alone(replica(states, 2)))

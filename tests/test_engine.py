@@ -111,7 +111,10 @@ def test_the_machine_code_by_name_is_auto_to_the_bit(flowing) -> None:
 @pytest.mark.parametrize("engine", [jg.Numba(), jg.Jax()])
 def test_a_number_of_steps_may_be_one_of_python(engine, flowing) -> None:
     state = flowing(0.7)
-    assert_same_bits(*(jg.advance(of(), state, steps, engine=engine) for steps in (100, STEPS)))
+    numbers = (100, np.int64(100), STEPS)
+    one, other, third = (jg.advance(of(), state, steps, engine=engine) for steps in numbers)
+    assert_same_bits(one, other)
+    assert_same_bits(one, third)
 
 
 @pytest.mark.parametrize("numerics", [{"engine": jg.Jax()}, {"solver": jg.Jacobi()}])

@@ -113,8 +113,8 @@ def advance_replica(
     """``advance`` for one replica, without checks."""
     # Copies: JAX refuses batches of NumPy numbers, over which vmap maps, in its custom rules.
     engine = engine_of(flow, numerics, state, observe)
-    flow, solver, state, steps = jax.tree.map(jnp.array, (flow, numerics.solver, state, steps))
-    return engine.advance(flow, solver, state, steps, observe)
+    flow, solver, state = jax.tree.map(jnp.array, (flow, numerics.solver, state))
+    return engine.advance(flow, solver, state, jnp.array(steps, jnp.int32), observe)
 
 
 def engine_of(
