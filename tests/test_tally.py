@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxgran.contact.law import contact_terms
+from jaxgran.contact.law import SolvedContact, contact_terms
 from jaxgran.dynamics.tally import (
     CONTACT,
     EXTREMES,
@@ -74,21 +74,8 @@ def test_terms_of_a_contact_stand_where_the_table_says():
         rng.uniform(0.1, 1, 9)
     )
     nx, ny = np.cos(angle), np.sin(angle)
-    terms = contact_terms(
-        nx,
-        ny,
-        distance,
-        overlap,
-        approach,
-        half_change,
-        one_plus_alpha,
-        p,
-        binary,
-        clustered,
-        1,
-        2,
-        3,
-    )
+    numbers = (nx, ny, distance, overlap, approach, half_change, one_plus_alpha, p, binary)
+    terms = contact_terms(SolvedContact(*numbers, clustered, 1, 2, 3))
     moment = distance * np.array([nx * nx, nx * ny, ny * ny])
     after = approach + 2 * half_change
     expected = {

@@ -130,34 +130,38 @@ class ContactTerms(NamedTuple):
     binary_dissipation: Number
 
 
-def contact_terms(
-    nx: Number,
-    ny: Number,
-    distance: Number,
-    overlap: Number,
-    approach: Number,
-    half_change: Number,
-    one_plus_alpha: Number,
-    impulse: Number,
-    binary_impulse: Number,
-    clustered: Number,
-    used: Number,
-    loaded: Number,
-    approaching: Number,
-) -> ContactTerms:
-    """What one contact adds to the running sums.
+class SolvedContact(NamedTuple):
+    """A contact whose impulse is known.
 
-    Args:
-      nx, ny, distance: unit normal and distance of the centres, in σ.
-      overlap: overlap in σ, not negative.
-      approach: relative normal velocity u⁻ before the step.
-      half_change: half its change by the impulses, (u⁺ − u⁻)/2.
-      one_plus_alpha: 1 + α.
-      impulse, binary_impulse: J = (1 + α) J₀, and the same if the collision were binary.
-      clustered: the impulse J where the contact is in a cluster, otherwise 0.
-      used, loaded, approaching: 1 where it is a contact, carries an impulse, approaches; otherwise
-        0.
+    nx, ny, distance: unit normal and distance of the centres, in σ.
+    overlap: overlap in σ, not negative.
+    approach: relative normal velocity u⁻ before the step.
+    half_change: half its change by the impulses, (u⁺ − u⁻)/2.
+    one_plus_alpha: 1 + α.
+    impulse, binary_impulse: J = (1 + α) J₀, and the same if the collision were binary.
+    clustered: the impulse J where the contact is in a cluster, otherwise 0.
+    used, loaded, approaching: 1 where it is a contact, carries an impulse, approaches; otherwise 0.
     """
+
+    nx: Number
+    ny: Number
+    distance: Number
+    overlap: Number
+    approach: Number
+    half_change: Number
+    one_plus_alpha: Number
+    impulse: Number
+    binary_impulse: Number
+    clustered: Number
+    used: Number
+    loaded: Number
+    approaching: Number
+
+
+def contact_terms(contact: SolvedContact) -> ContactTerms:
+    """What one contact adds to the running sums."""
+    nx, ny, distance, overlap, approach, half_change, one_plus_alpha = contact[:7]
+    impulse, binary_impulse, clustered, used, loaded, approaching = contact[7:]
     xx, xy, yy = nx * nx * distance, nx * ny * distance, ny * ny * distance
     # The impulse is zero where the contact does not approach
     binary_power = -binary_impulse * approach

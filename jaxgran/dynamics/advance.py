@@ -71,6 +71,7 @@ def advance(
     Examples:
       How the energy after ten steps follows from the restitution:
 
+      >>> from dataclasses import replace
       >>> import jaxgran as jg
       >>> flow = ShearFlow(grains=16, restitution=0.5, packing_fraction=0.6, timestep=1e-3)
       >>> state = jg.heated(flow, jax.random.key(0))

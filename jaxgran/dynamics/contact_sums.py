@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxgran.contact.delassus import NetworkOperator, loads_of_grains
-from jaxgran.contact.law import contact_terms
+from jaxgran.contact.law import SolvedContact, contact_terms
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.solver import Solution
 from jaxgran.model.flow import ShearFlow
@@ -54,18 +54,19 @@ def sums_of_contacts(
     overlap = jnp.where(network.used, jnp.maximum(reach - network.distances, 0), 0)
     loaded = p > 0
     loads = taken(impulses.loaded, network.i) + taken(impulses.loaded, network.j)
-    flags = (network.used, loaded, network.approach < 0)
-    terms = contact_terms(
-        network.normals[:, 0],
-        network.normals[:, 1],
-        network.distances,
-        overlap,
-        network.approach,
-        impulses.changes / 2,
-        1 + flow.restitution,
-        p,
-        impulses.binary,
-        jnp.where(loaded & (loads > 2), p, 0),
-        *(flag.astype(p.dtype) for flag in flags),
+    contact = SolvedContact(
+        nx=network.normals[:, 0],
+        ny=network.normals[:, 1],
+        distance=network.distances,
+        overlap=overlap,
+        approach=network.approach,
+        half_change=impulses.changes / 2,
+        one_plus_alpha=1 + flow.restitution,
+        impulse=p,
+        binary_impulse=impulses.binary,
+        clustered=jnp.where(loaded & (loads > 2), p, 0),
+        used=network.used.astype(p.dtype),
+        loaded=loaded.astype(p.dtype),
+        approaching=(network.approach < 0).astype(p.dtype),
     )
-    return jnp.stack(sums_of(terms)), jnp.max(overlap)
+    return jnp.stack(sums_of(contact_terms(contact))), jnp.max(overlap)

@@ -187,6 +187,6 @@ def events_by_jax(
 
     def visit(at: tuple[Array, Carry]) -> tuple[Array, Carry]:
         number, now = at
-        return number + unfinished(constants, now), _next(constants, now)
+        return number + unfinished(constants, now).astype(number.dtype), _next(constants, now)
 
     return lax.while_loop(keep_going, visit, (jnp.int32(0), start(constants, state)))[0]

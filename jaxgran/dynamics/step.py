@@ -52,7 +52,7 @@ from jaxgran.dynamics.observer import (
     with_contacts,
     with_flight,
 )
-from jaxgran.dynamics.tally import RunningSums, empty_sums
+from jaxgran.dynamics.tally import CONTACT, FLIGHT, LARGEST, SOLVE, RunningSums, empty_sums
 from jaxgran.dynamics.velocity_scales import READ_AFTER, readings
 from jaxgran.model.control_flow import any_replica, switch_replica, where_active
 from jaxgran.model.flow import ShearFlow
@@ -154,10 +154,12 @@ def closing_speed_bound(
 
     A gap closes no faster than 2 max|c| from the peculiar velocities and γ̇ Δx Δy / r ≤ γ̇ r / 2
     from the shear. A pair outside of the list has to close the last part of its way, from r = d +
-    skin to r = d. Within a flight |c| grows by a factor 1 + γ̇ t at most.
+    skin to r = d. Within a flight and the look-ahead of its last step, |c| grows by a factor
+    1 + γ̇ t at most.
     """
     cx, cy = lax.stop_gradient(velocities).T  # the choice of pairs has no derivative
-    longest = jnp.maximum(LONGEST_FLIGHT, flow.shear_rate * flow.timestep)
+    step = flow.shear_rate * flow.timestep
+    longest = jnp.maximum(LONGEST_FLIGHT, step) + flow.activation * step
     speed = jnp.sqrt(largest(cx * cx + cy * cy)) * (1 + longest)
     return 2 * speed + flow.shear_rate * (2 * jnp.max(lax.stop_gradient(grains.radii)) + skin) / 2
 
@@ -253,7 +255,7 @@ def _with_flight(
     xx, xy, yy = (jnp.dot(p, c, precision=lax.Precision.HIGHEST) for p, c in products)
     means = kinetic_means(xx, xy, yy, shear_rate * time)
     flight = jnp.stack([time, steps.astype(time.dtype), *(time * mean for mean in means)])
-    return sums._replace(flight=sums.flight + flight)
+    return sums.with_sums(flight=sums.of(FLIGHT) + flight)
 
 
 class Collision(NamedTuple):
@@ -313,8 +315,8 @@ def collide(constants: Constants, now: Carry, needs_solve: Bool[Array, ""]) -> C
 
 def _no_collision(now: Carry, delays: Array | None) -> Collision:
     """No contact approaches."""
-    still, zero = jnp.zeros_like(now.velocities), jnp.zeros_like(now.sums.largest[0])
-    no_sums, shift = jnp.zeros_like(now.sums.contact), None if delays is None else still
+    still, zero = jnp.zeros_like(now.velocities), jnp.zeros_like(now.slack)
+    no_sums, shift = jnp.zeros_like(now.sums.of(CONTACT)), None if delays is None else still
     return Collision(
         still, no_sums, zero, jnp.int32(0), zero, jnp.int32(0), now.sums.user_sums, shift
     )
@@ -361,13 +363,13 @@ def _with_collision(sums: RunningSums, collision: Collision, acts: Array) -> Run
     """The sums with what the contacts of one step add."""
     solves = acts, collision.iterations, collision.status != Status.ok
     largest_values = jnp.stack([collision.largest_overlap, collision.residual])
-    return sums._replace(
-        contact=sums.contact + collision.contact_sums,
-        solve=sums.solve + jnp.stack([x.astype(sums.solve.dtype) for x in solves]),
-        largest=jnp.maximum(sums.largest, largest_values),
-        status=jnp.maximum(sums.status, collision.status),
-        user_sums=collision.user_sums,
+    added = sums.with_sums(
+        contact=sums.of(CONTACT) + collision.contact_sums,
+        solve=sums.of(SOLVE) + jnp.stack([x.astype(sums.numbers.dtype) for x in solves]),
+        largest=jnp.maximum(sums.of(LARGEST), largest_values),
     )
+    status = jnp.maximum(sums.status, collision.status)
+    return added._replace(status=status, user_sums=collision.user_sums)
 
 
 def observer_of(constants: Constants, now: Carry) -> ObserveNow | None:
@@ -387,11 +389,11 @@ def _with_readings(constants: Constants, now: Carry) -> Carry:
     if not constants.buffers:  # loops for derivatives are too short for a second reading
         return now
     sums, collisions_read = now.sums, now.collisions_read
-    due = sums.collisions - collisions_read >= READ_AFTER * constants.grains.radii.size / 2
+    due = sums.value("collisions") - collisions_read >= READ_AFTER * constants.grains.radii.size / 2
 
     def read() -> tuple[RunningSums, Array]:
         state = _state_of(constants, now)
-        read_now = sums.with_reading(readings(state)), sums.collisions
+        read_now = sums.with_reading(readings(state)), sums.value("collisions")
         return where_active(due, read_now, (sums, collisions_read))
 
     sums_after, read_after = lax.cond(any_replica(due), read, lambda: (sums, collisions_read))

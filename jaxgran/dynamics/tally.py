@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.law import ContactTerms
@@ -192,49 +193,43 @@ if ContactTerms._fields != _columns(CONTACT):
 class RunningSums(NamedTuple):
     """What the time loop of an engine carries, until ``tally`` gives the sums their names.
 
-    ==========  ===========  =======================================================================
-    field       shape        meaning
-    ==========  ===========  =======================================================================
-    flight      (numbers,)   the sums of each kind, in the order of ``LAYOUT``
-    contact     (numbers,)
-    solve       (numbers,)
-    largest     (numbers,)
-    instant     (numbers,)
-    read_until  ()           time of the last reading
-    status      ()           the worst status
-    user_sums   pytree       sums of what a user's function observes, see ``observer``; () without
-                             one
-    ==========  ===========  =======================================================================
+    =========  ==========  =========================================================================
+    field      shape       meaning
+    =========  ==========  =========================================================================
+    numbers    (numbers,)  the sums in the order of ``LAYOUT``, and the time of the last reading
+    status     ()          the worst status
+    user_sums  pytree      sums of what a user's function observes, see ``observer``; () without one
+    =========  ==========  =========================================================================
     """
 
-    flight: Float[Array, " flight"]
-    contact: Float[Array, " contact"]
-    solve: Float[Array, " solve"]
-    largest: Float[Array, " largest"]
-    instant: Float[Array, " instant"]
-    read_until: Float[Array, ""]
+    numbers: Float[Array, " numbers"]
     status: Int[Array, ""]
     user_sums: Any = ()
 
-    @property
-    def duration(self) -> Float[Array, ""]:
-        """Time so far."""
-        return self._named("duration")
+    def of(self, kind: str) -> Float[Array, " kind"]:
+        """The sums of one kind."""
+        return self.numbers[span_of(kind)]
 
-    @property
-    def steps(self) -> Float[Array, ""]:
-        """Time steps so far."""
-        return self._named("steps")
+    def with_sums(self, **kinds: Float[Array, " kind"]) -> "RunningSums":
+        """The sums with those of some kinds replaced."""
+        numbers = self.numbers
+        for kind, values in kinds.items():
+            numbers = lax.dynamic_update_slice(numbers, values, (span_of(kind).start,))
+        return self._replace(numbers=numbers)
 
-    @property
-    def collisions(self) -> Float[Array, ""]:
-        """Contacts that approached, so far."""
-        return self._named("collisions")
+    def value(self, name: str) -> Array:
+        """The sum of this name."""
+        numbers = self.numbers[LAYOUT[name]]
+        if TABLE.get(name, {}).get("shape") == _TENSOR:
+            return taken(numbers, jnp.asarray([0, 1, 1, 2])).reshape(2, 2)
+        return numbers[0]
 
     def with_reading(self, readings: Float[Array, " instant"]) -> "RunningSums":
         """The sums with readings of the state now, which stand for the time since the last ones."""
-        instant = self.instant + (self.duration - self.read_until) * readings
-        return self._replace(instant=instant, read_until=self.duration)
+        duration = self.value("duration")
+        since = duration - self.value("read_until")
+        read = self.with_sums(instant=self.of(INSTANT) + since * readings)
+        return read._replace(numbers=read.numbers.at[place_of("read_until")].set(duration))
 
     def tally(self, **ends: Array) -> Tally:
         """The tally; ``nonfinite`` if a sum is not finite.
@@ -242,33 +237,14 @@ class RunningSums(NamedTuple):
         Args:
           ends: the sums that are known only at the end of an advance, by name, without the status.
         """
-        sums = self.flight, self.contact, self.solve, self.largest, self.instant
-        finite = status_if_finite(*sums, *ends.values())
+        finite = status_if_finite(self.numbers, *ends.values())
         ends = {**ends, "status": jnp.maximum(self.status, finite)}
-        return Tally(**{name: ends[name] if name in ends else self._named(name) for name in TABLE})
-
-    def _named(self, name: str) -> Array:
-        kind, shape, place = TABLE[name]["kind"], TABLE[name]["shape"], LAYOUT[name]
-        begin = span_of(kind).start
-        numbers = getattr(self, kind)[place.start - begin : place.stop - begin]
-        return (
-            taken(numbers, jnp.asarray([0, 1, 1, 2])).reshape(2, 2)
-            if shape == _TENSOR
-            else numbers.reshape(shape)
-        )
-
-
-def sums_from_row(numbers: Float[Array, " numbers"], status: Int[Array, ""]) -> RunningSums:
-    """The running sums of an engine that keeps them in one row."""
-    flight, contact, solve, largest, instant = (numbers[span_of(kind)] for kind in KINDS)
-    return RunningSums(
-        flight, contact, solve, largest, instant, numbers[place_of("read_until")], status
-    )
+        return Tally(**{name: ends[name] if name in ends else self.value(name) for name in TABLE})
 
 
 def empty_sums(dtype: jnp.dtype) -> RunningSums:
     """The running sums of no time at all."""
-    return sums_from_row(jnp.zeros(NUMBERS, dtype), jnp.int32(0))
+    return RunningSums(jnp.zeros(NUMBERS, dtype), jnp.int32(0))
 
 
 def empty_tally(dtype: jnp.dtype) -> Tally:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Int
 from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.jax_engine import ended
 from jaxgran.dynamics.numba_engine import layout
-from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
+from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State, kinetic_energy, status_at_start
@@ -146,7 +146,7 @@ def call_numba(
     positions, velocities, blocks, memory, records = call(*operands)
     last = blocks[-1]
     end = State(grains, positions, velocities, state.side, last[layout.TILT])
-    sums = jax.vmap(sums_from_row)(blocks[:, :NUMBERS], blocks[:, layout.STATUS].astype(jnp.int32))
+    sums = RunningSums(blocks[:, :NUMBERS], blocks[:, layout.STATUS].astype(jnp.int32))
     recorded = last[layout.RECORDED].astype(jnp.int32)
     kinetic, drift = blocks[:, layout.KINETIC], blocks[:, layout.DRIFT]
     return NumbaCall(end, sums, kinetic, drift, last[layout.SUSPENDED], recorded, records, memory)

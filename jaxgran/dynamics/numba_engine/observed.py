@@ -68,7 +68,8 @@ def observe_by_numba(
     def called(now: _Progress) -> _Progress:
         call = call_numba(flow, solver, state, steps[None], room, now.suspended, now.memory)
         sums = jax.tree.map(lambda x: x[0], call.sums)
-        user_sums = _with_records(flow, state, observe, now.sums.user_sums, call, sums.steps)
+        end_step = sums.value("steps")
+        user_sums = _with_records(flow, state, observe, now.sums.user_sums, call, end_step)
         sums = sums._replace(user_sums=user_sums)
         return _Progress(call.suspended > 0, call.end, sums, call.suspended, call.memory)
 

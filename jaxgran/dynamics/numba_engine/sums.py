@@ -2,6 +2,7 @@
 ``dynamics.tally``.
 """
 
+from jaxgran.contact.law import SolvedContact
 from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit
 from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
@@ -64,7 +65,7 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
         change = nx * (impulses[i, 0] * mi - impulses[j, 0] * mj) + ny * (
             impulses[i, 1] * mi - impulses[j, 1] * mj
         )
-        terms = contact_terms(
+        contact = SolvedContact(
             nx,
             ny,
             distance,
@@ -79,6 +80,7 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
             1.0 if impulse > 0.0 else 0.0,
             1.0 if approach < 0.0 else 0.0,
         )
+        terms = contact_terms(contact)
         padded = terms[:] + terms[:_PADS]
         for n in range(_PADDED):
             step_sums[n] += padded[n]
