@@ -56,12 +56,13 @@ def switch_replica(
 ) -> T:
     """The result of the branch of the given number, counted from one, or ``default`` for 0.
 
-    A branch is given whether this replica takes it. A batch computes each branch that one of its
-    replicas takes, and no other, so that the result of a replica does not depend on the batch.
+    A branch is given whether this replica takes it, which is known to the compiler outside a batch.
+    A batch computes each branch that one of its replicas takes, and no other, so that the result of
+    a replica does not depend on the batch.
     """
 
     def taken(take: Callable[[jax.Array], T], mine: jax.Array, result: T) -> T:
-        return where_active(mine, take(mine), result)
+        return where_active(mine, take(_takes_part(mine)), result)
 
     result: Any = default
     for number, take in enumerate(branches, 1):
