@@ -33,7 +33,6 @@ from dataclasses import dataclass, fields
 from inspect import isfunction
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -43,6 +42,7 @@ from jaxgran.contact.delassus import DelassusOperator
 from jaxgran.contact.law import LONGEST_STRIDE, PROGRESS, WINDOW
 from jaxgran.model.checks import InputError, concrete_or_none, require_number, short_repr
 from jaxgran.model.choices import SolverName
+from jaxgran.model.values import register_fields
 
 
 class Iterate(NamedTuple):
@@ -103,7 +103,7 @@ class ProjectedMethod:
                     f"a ProjectedMethod overrides bound, init, propose or learn, and {name} of "
                     f"{cls.__name__} would never be called; name a function of your own _{name}."
                 )
-        _register(cls)
+        register_fields(cls)
 
     def __post_init__(self) -> None:
         require_number(
@@ -153,29 +153,7 @@ class ProjectedMethod:
         return now.memory
 
 
-def _register(cls: type) -> None:
-    """Make a class of methods a pytree, whose fields are read when an instance is first
-    flattened.
-    """
-
-    def names(static: bool) -> list[str]:
-        return [field.name for field in fields(cls) if bool(field.metadata.get("static")) == static]
-
-    def flatten(solver: Any) -> tuple[list[tuple[Any, Any]], tuple]:
-        leaves = [(jax.tree_util.GetAttrKey(name), getattr(solver, name)) for name in names(False)]
-        return leaves, tuple(getattr(solver, name) for name in names(True))
-
-    def unflatten(static: tuple, leaves: Any) -> Any:
-        # without checks: JAX also passes axis numbers and placeholders
-        solver = object.__new__(cls)
-        for name, value in zip([*names(True), *names(False)], (*static, *leaves), strict=True):
-            object.__setattr__(solver, name, value)
-        return solver
-
-    jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
-
-
-_register(ProjectedMethod)
+register_fields(ProjectedMethod)
 
 
 class _GuardedSteps(NamedTuple):

@@ -44,6 +44,11 @@ def _unflatten(cls: type, static: tuple, leaves: Any) -> Any:
     return value
 
 
+def register_fields(cls: type) -> None:
+    """Make a dataclass a pytree by its fields, which are read when a value is first flattened."""
+    register_pytree_with_keys(cls, _flatten_with_keys, partial(_unflatten, cls), _flatten)
+
+
 class Value:
     """Base of dataclasses that are pytrees by their fields, but for those with the metadata
     ``static``.
@@ -53,7 +58,7 @@ class Value:
     """
 
     def __init_subclass__(cls) -> None:
-        register_pytree_with_keys(cls, _flatten_with_keys, partial(_unflatten, cls), _flatten)
+        register_fields(cls)
 
     def __eq__(self, other: object) -> bool:
         """Whether two values are of one class and hold equal numbers of equal shapes.
