@@ -30,8 +30,8 @@ from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics import advance as advance_module
 from jaxgran.dynamics import step
 from jaxgran.dynamics.engine import Jax, Numba, engine_named
-from jaxgran.dynamics.numba_engine import cluster_solver, layout
-from jaxgran.dynamics.numba_engine.ffi import object_file
+from jaxgran.dynamics.numba_engine import arrays, cluster_solver
+from jaxgran.dynamics.numba_engine.ffi import engine_folder
 from jaxgran.dynamics.numba_engine.near_pairs import LIFE, closing_speed_bound, find_near_pairs
 from jaxgran.dynamics.step import LONGEST_FLIGHT
 from jaxgran.dynamics.tally import TABLE
@@ -389,7 +389,7 @@ def near_pairs_found():
     engine is the same.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(numba.config, "CACHE_DIR", str(object_file().with_suffix("")))
+        patch.setattr(numba.config, "CACHE_DIR", str(engine_folder()))
         return numba.njit(cache=True)(find_near_pairs.py_func)
 
 
@@ -419,8 +419,8 @@ def test_near_pairs_are_those_of_all_images(
         np.empty((3, count)),
     )
     listed = np.empty((2, room + 1), np.uint32), np.empty((2, room + 1))
-    memory = layout.Pairs(*listed, *4 * [None], *cells, *3 * [None])
-    grains = layout.Grains(motion, np.stack([radii, np.ones(count)], axis=-1))
+    memory = arrays.Pairs(*listed, *4 * [None], *cells, *3 * [None])
+    grains = arrays.Grains(motion, np.stack([radii, np.ones(count)], axis=-1), None)
     found = near_pairs_found(grains, memory, side, tilt, reach, skin, room)
     pairs, images = memory.ends, memory.images
     expected = set()

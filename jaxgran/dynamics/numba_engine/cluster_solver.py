@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from jaxgran.contact.law import JAMMED_RESPONSE, LONGEST_STRIDE, PROGRESS, WINDOW
-from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit, njit
+from jaxgran.dynamics.numba_engine.compilation import LAW, njit
 from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     BEST,
@@ -52,7 +52,7 @@ _PARTS = 8
 _RELAXATION = np.minimum(1 + 0.075 * np.log2(np.maximum(np.arange(641), 1)), 1.7)
 
 
-@inline_njit
+@njit
 def solve_cluster(m, target, max_steps, grains, network, clusters):
     """Write the impulses J₀ of cluster m at restitution zero.
 
@@ -82,7 +82,7 @@ def solve_cluster(m, target, max_steps, grains, network, clusters):
     return iterations, squared_residual, status
 
 
-@inline_njit
+@njit
 def _take_contacts(start, size, grains, network, clusters):
     """Copy the contacts of a cluster for the solver, one from each part of the cluster in turn."""
     source, places, ends = clusters.source, clusters.places, clusters.ends
@@ -111,7 +111,7 @@ def _take_contacts(start, size, grains, network, clusters):
             n = np.uint64(start) + begin
 
 
-@inline_njit
+@njit
 def _mu_response(c, rows, ends, dv):
     """μ (W J) of a contact, from the changes of the grains' velocities."""
     i, j = ends[c, FIRST], ends[c, SECOND]
@@ -131,7 +131,7 @@ def _is_jammed(size, clusters):
     return j_w_j < JAMMED_RESPONSE * minus_j_u
 
 
-@inline_njit
+@njit
 def _sweep(size, target, max_sweeps, clusters):
     """Projected Gauss–Seidel sweeps with over-relaxation; returns their number and the squared
     residual.
@@ -246,7 +246,7 @@ def _descend(size, target, max_iterations, clusters):
     return iterations, best
 
 
-@inline_njit
+@njit
 def _start_descent(size, clusters):
     """Write the diagonal D and the response W J of the contacts of a cluster."""
     rows, iterate, ends = clusters.rows, clusters.iterate, clusters.ends

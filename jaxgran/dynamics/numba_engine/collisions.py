@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from jaxgran.dynamics.numba_engine.cluster_solver import solve_cluster
-from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit
+from jaxgran.dynamics.numba_engine.compilation import LAW, njit
 from jaxgran.dynamics.numba_engine.layout import (
     EPSILON,
     FIRST,
@@ -29,7 +29,7 @@ from jaxgran.dynamics.numba_engine.sums import add_contacts, add_solve
 residual_target, relative_residual = LAW["residual_target"], LAW["relative_residual"]
 
 
-@inline_njit
+@njit
 def collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, sums):
     """Solve the contacts of a step and add them to the sums; returns the number of their grains,
     and the status.
@@ -47,7 +47,7 @@ def collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, sums
     return touched_count, status
 
 
-@inline_njit
+@njit
 def solve_network(contacts, touched_count, target, max_steps, grains, network, clusters):
     """Write the impulses J₀ of a network at restitution zero, to a residual of ``target``.
 
@@ -70,7 +70,7 @@ def solve_network(contacts, touched_count, target, max_steps, grains, network, c
     return iterations, squared_residual, status
 
 
-@inline_njit
+@njit
 def strike(touched_count, t, shear_rate, grains, network, clusters, kinetic, max_speed):
     """Change the velocities of the struck grains; returns Σ m c ⊗ c and the largest speed after it,
     and whether all is finite.
@@ -101,7 +101,7 @@ def strike(touched_count, t, shear_rate, grains, network, clusters, kinetic, max
     return (xx, xy, yy), max_speed, finite
 
 
-@inline_njit
+@njit
 def list_struck_pairs(k, touched_count, contacts, overfull, pairs, network):
     """List the pairs of the struck grains, each once, for a new prediction; clears the impulses.
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.numba_engine.compilation import CELL, inline_njit, njit, whole_part
+from jaxgran.dynamics.numba_engine.compilation import CELL, njit, whole_part
 from jaxgran.dynamics.numba_engine.layout import INVERSE_MASS, RADIUS, VX, VY, X, Y
 
 image_in_cell = CELL["image_in_cell"]
@@ -13,11 +13,11 @@ _CACHED_GRAINS, _ROW_HEIGHT = 2000, 2.0  # larger flows are put in order, in cel
 
 
 @njit
-def put_in_order(positions, side, tilt, order):
+def put_in_order(positions, side, tilt, grains, pairs):
     """Write an order of the grains, row by row, that keeps neighbours close in memory if a flow
-    outgrows the caches.
+    outgrows the caches; ``pairs`` has memory for the sorting.
     """
-    in_state, cells, starts, count = order.in_state, order.cells, order.starts, order.in_state.size
+    in_state, cells, starts, count = grains.in_state, pairs.cells, pairs.starts, len(positions)
     across = 1
     if count > _CACHED_GRAINS:
         across = max(1, whole_part(side / _ROW_HEIGHT, math.sqrt(count)))
@@ -39,11 +39,11 @@ def put_in_order(positions, side, tilt, order):
 
 
 @njit
-def read_state(positions, velocities, radii, masses, in_state, shear_rate, grains):
+def read_state(positions, velocities, radii, masses, shear_rate, grains):
     """Copy the grains, with velocities of the laboratory; returns the largest diameter and whether
     all is finite.
     """
-    motion, constants = grains.motion, grains.constants
+    motion, constants, in_state = grains.motion, grains.constants, grains.in_state
     largest_diameter, finite = 0.0, True
     for g in range(in_state.size):
         n = in_state[g]
@@ -57,7 +57,7 @@ def read_state(positions, velocities, radii, masses, in_state, shear_rate, grain
     return largest_diameter, finite
 
 
-@inline_njit
+@njit
 def bring_into_cell(grains, side, tilt, shear_rate):
     """Bring the grains into the cell, at the same peculiar velocities; returns the largest peculiar
     speed.
@@ -75,7 +75,7 @@ def bring_into_cell(grains, side, tilt, shear_rate):
     return math.sqrt(squared_speed)
 
 
-@inline_njit
+@njit
 def kinetic_sums(grains, shear_rate):
     """Σ m c_x c_x, Σ m c_x c_y and Σ m c_y c_y, just after a search."""
     motion, constants = grains.motion, grains.constants
@@ -89,7 +89,7 @@ def kinetic_sums(grains, shear_rate):
     return xx, xy, yy
 
 
-@inline_njit
+@njit
 def move_grains(t, grains):
     """Move the grains to their positions at the time t since the search."""
     motion = grains.motion
@@ -99,13 +99,23 @@ def move_grains(t, grains):
 
 
 @njit
-def write_state(in_state, side, tilt, shear_rate, grains, new_positions, new_velocities):
+def write_state(side, tilt, shear_rate, grains, new_positions, new_velocities):
     """Write the positions, in the cell, and the peculiar velocities of the grains."""
     motion = grains.motion
-    for g in range(in_state.size):
-        n = in_state[g]
+    for g in range(motion.shape[0]):
+        n = grains.in_state[g]
         new_positions[n, 0], new_positions[n, 1] = image_in_cell(
             motion[g, X], motion[g, Y], side, tilt
         )
         new_velocities[n, 0] = motion[g, VX] - shear_rate * motion[g, Y]
         new_velocities[n, 1] = motion[g, VY]
+
+
+@njit
+def write_motion(grains, new_positions, new_velocities):
+    """Write the positions as they are, and the velocities in the laboratory."""
+    motion = grains.motion
+    for g in range(motion.shape[0]):
+        n = grains.in_state[g]
+        new_positions[n, 0], new_positions[n, 1] = motion[g, X], motion[g, Y]
+        new_velocities[n, 0], new_velocities[n, 1] = motion[g, VX], motion[g, VY]

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.numba_engine.compilation import CELL, inline_njit, njit, whole_part
+from jaxgran.dynamics.numba_engine.compilation import CELL, njit, whole_part
 from jaxgran.dynamics.numba_engine.layout import (
     FIRST,
     IMAGE_ROW,
@@ -22,7 +22,7 @@ LIFE = 0.1
 _ATTEMPTS = 12  # with ever narrower skins, while a list has more pairs than room
 
 
-@inline_njit
+@njit
 def closing_speed_bound(max_speed, shear_rate, distance):
     """Bound on how fast the gap of a pair within a distance closes while a list is valid, see
     ``dynamics.step``.
@@ -63,7 +63,7 @@ def find_near_pairs(grains, pairs, side, tilt, reach, skin, capacity):
     return _pairs_of_all(grains, pairs, side, tilt, skin, capacity)
 
 
-@inline_njit
+@njit
 def _sort_into_cells(grains, pairs, side, tilt, rows, columns):
     """Sort the grains into cells row by row, those of a cell at ``starts[cell] : starts[cell +
     1]``.
@@ -90,7 +90,7 @@ def _sort_into_cells(grains, pairs, side, tilt, rows, columns):
     starts[rows * columns] = motion.shape[0]
 
 
-@inline_njit
+@njit
 def _pairs_of_cells(pairs, side, tilt, rows, columns, skin, capacity):
     """Pairs within each cell, with its right neighbour, and with the three above it."""
     starts, sorted_grains, places = pairs.starts, pairs.sorted, pairs.places
@@ -136,7 +136,7 @@ def _pairs_of_cells(pairs, side, tilt, rows, columns, skin, capacity):
     return count
 
 
-@inline_njit
+@njit
 def _pairs_of_all(grains, pairs, side, tilt, skin, capacity):
     """Compare all pairs by nearest images, in a periodic cell too small for a grid of 3×3."""
     motion, constants, ends, images = grains.motion, grains.constants, pairs.ends, pairs.images
@@ -156,7 +156,7 @@ def _pairs_of_all(grains, pairs, side, tilt, skin, capacity):
     return count
 
 
-@inline_njit
+@njit
 def _index_pairs(pairs, count):
     """The pairs of grain g are those in ``of_grain[offsets[g] : offsets[g + 1]]``."""
     ends, offsets, of_grain = pairs.ends, pairs.offsets, pairs.of_grain

@@ -3,7 +3,7 @@
 import math
 
 from jaxgran.dynamics.numba_engine.calendar import pair_motion
-from jaxgran.dynamics.numba_engine.compilation import inline_njit
+from jaxgran.dynamics.numba_engine.compilation import njit
 from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     DISTANCE,
@@ -19,7 +19,7 @@ from jaxgran.dynamics.numba_engine.layout import (
 )
 
 
-@inline_njit
+@njit
 def make_network(contacts, t, flow, grains, pairs, network):
     """Write the contacts of a step and their grains; returns the number of the grains, Σ min(0,
     u⁻)² and the largest overlap.
@@ -48,7 +48,7 @@ def make_network(contacts, t, flow, grains, pairs, network):
     return touched_count, scale, largest_overlap
 
 
-@inline_njit
+@njit
 def solve_isolated(contacts, grains, network):
     """Write the impulses of isolated pairs; returns the number of the other contacts."""
     ends, rows, degree, constants = network.ends, network.rows, network.degree, grains.constants
@@ -63,7 +63,7 @@ def solve_isolated(contacts, grains, network):
     return coupled
 
 
-@inline_njit
+@njit
 def find_clusters(contacts, touched_count, network, clusters):
     """Find the clusters in which a contact approaches, each by a breadth-first search from such a
     contact.
@@ -114,7 +114,7 @@ def find_clusters(contacts, touched_count, network, clusters):
     return count
 
 
-@inline_njit
+@njit
 def sum_impulses(contacts, touched_count, one_plus_alpha, network):
     """Add up the impulses on every grain, and its contacts that carry one."""
     ends, rows, touched = network.ends, network.rows, network.touched

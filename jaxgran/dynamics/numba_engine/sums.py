@@ -2,7 +2,7 @@
 ``dynamics.tally``.
 """
 
-from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit
+from jaxgran.dynamics.numba_engine.compilation import LAW, njit
 from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     DISTANCE,
@@ -31,7 +31,7 @@ _UNCONVERGED = place_of("unconverged")
 _LARGEST_OVERLAP, _WORST_RESIDUAL = place_of("largest_overlap"), place_of("worst_residual")
 
 
-@inline_njit
+@njit
 def add_flight(sums, steps, flight, strain, kinetic):
     """Add a flight of so many steps, with Σ m c ⊗ c at its beginning, and return that at its end.
 
@@ -47,7 +47,7 @@ def add_flight(sums, steps, flight, strain, kinetic):
     return xx + strain * (strain * yy - 2 * xy), xy - strain * yy, yy
 
 
-@inline_njit
+@njit
 def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
     """Add what the contacts of one step contribute, by the law of a contact; ``step_sums`` is
     memory for it.
@@ -86,7 +86,7 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
         sums[_FIRST_TERM + n] += step_sums[n]
 
 
-@inline_njit
+@njit
 def add_solve(sums, iterations, residual, status, overlap):
     """Add one solve."""
     sums[_SOLVES] += 1
