@@ -409,9 +409,10 @@ def test_near_pairs_are_those_of_all_images(
     side = np.sqrt(np.pi * np.sum(radii**2) / packing_fraction)
     reach = 2 * radii.max() + skin
     assume(reach <= side / 2)  # nearest images are unique
-    motion = np.zeros((count, 4))
-    motion[:, :2] = rng.uniform(0, side, (count, 2))
-    motion[:, 0] -= np.floor((motion[:, 0] - tilt * motion[:, 1]) / side) * side
+    positions = rng.uniform(0, side, (count, 2))
+    positions[:, 0] -= np.floor((positions[:, 0] - tilt * positions[:, 1]) / side) * side
+    motion, constants = np.zeros(count, arrays.MOTION), np.ones(count, arrays.CONSTANTS)
+    motion["x"], motion["y"], constants["radius"] = *positions.T, radii
     room = count * (count - 1) // 2
     cells = (
         np.empty(max(9, 2 * count) + 1, np.uint32),
@@ -420,14 +421,14 @@ def test_near_pairs_are_those_of_all_images(
     )
     listed = np.empty((2, room + 1), np.uint32), np.empty((2, room + 1))
     memory = arrays.Pairs(*listed, *4 * [None], *cells, *3 * [None])
-    grains = arrays.Grains(motion, np.stack([radii, np.ones(count)], axis=-1), None)
+    grains = arrays.Grains(motion, constants, None)
     found = near_pairs_found(grains, memory, side, tilt, reach, skin, room)
     pairs, images = memory.ends, memory.images
     expected = set()
     for row in (-1, 0, 1):
         for column in (-2, -1, 0, 1, 2):
             shift = np.array([(column + row * tilt) * side, row * side])
-            apart = motion[:, None, :2] - motion[None, :, :2] - shift
+            apart = positions[:, None] - positions[None, :] - shift
             near = np.hypot(*np.moveaxis(apart, -1, 0)) <= radii[:, None] + radii[None, :] + skin
             expected |= {(i, j, row, column) for i, j in np.argwhere(near) if i < j}
     across = np.round(images[0, :found] / side - images[1, :found] * tilt).astype(int)

@@ -17,7 +17,6 @@ from jaxgran.dynamics.numba_engine.layout import (
     FIRST,
     IMPULSE,
     INFEASIBLE,
-    INVERSE_MASS,
     NX,
     NY,
     SECOND,
@@ -49,7 +48,7 @@ def _solve(ends, normals, inverse_masses, approach, impulses, tolerance, max_ste
     arrays = arrays_of(count)
     grains, network, clusters = arrays.grains, arrays.network, arrays.clusters
     for g in range(count):
-        grains.constants[g, INVERSE_MASS] = inverse_masses[g]
+        grains.constants[g].inverse_mass = inverse_masses[g]
     scale, touched_count = 0.0, 0
     for c in range(contacts):
         for end in (FIRST, SECOND):

@@ -1,10 +1,8 @@
 """Advances one replica and sums what a user's function observes, with the engine ``Numba`` or
 ``Jax``.
 
-The numba engine does not call the function. It records the steps that it visits until the buffer of
-records is full; then JAX applies the function to the records, and the engine goes on where it was
-suspended. So only the function is compiled, not an engine, and the trajectory is that of
-``advance`` to the bit.
+The numba engine does not call the function, but records the steps that it visits, to which JAX
+applies the function, see ``numba_engine.observed``.
 """
 
 from functools import partial

@@ -1,7 +1,6 @@
 """The arrays of the numba engine for one replica.
 
-Arrays are passed whole and indexed by row and column. Indices are unsigned, which spares a test for
-negative ones.
+Arrays are passed whole. Indices are unsigned, which spares a test for negative ones.
 """
 
 from typing import Any, NamedTuple
@@ -15,101 +14,76 @@ from jaxgran.dynamics.tally import NUMBERS
 _PAIRS_PER_GRAIN = 16  # capacity
 
 
+def _record(fields: str) -> np.dtype:
+    return np.dtype([(name, np.float64) for name in fields.split()])
+
+
+MOTION = _record("x y vx vy")
+CONSTANTS = _record("radius inverse_mass")
+# A contact in the solver: μ n, μ u⁻, 1/μ, 1/(μ m_i), 1/(μ m_j) and J, with the reduced mass μ;
+# padded to a cache line
+CONTACT = _record("mu_nx mu_ny mu_u inverse_mu inverse_mu_mi inverse_mu_mj impulse padding")
+# A contact in the method of Barzilai and Borwein: W J, the last changes of J and of W J, J of the
+# best iterate, and the diagonal D
+ITERATE = _record("response step response_change best bound")
+
+
 class Grains(NamedTuple):
     """The grains. Positions in the laboratory are r + v t with t counted from the last search for
     near pairs.
-
-    motion: (grains, 4), r and v in the laboratory.
-    constants: (grains, 2), radius and inverse mass.
-    in_state: (grains,), the index of each grain in the state.
     """
 
-    motion: Any
-    constants: Any
-    in_state: Any
+    motion: Any  # (grains,) of ``MOTION``, r and v in the laboratory
+    constants: Any  # (grains,) of ``CONSTANTS``
+    in_state: Any  # (grains,), the index of each grain in the state
 
 
 class Pairs(NamedTuple):
-    """Near pairs, padded to whole ``LANES``, with a spare slot for a pair beyond the capacity.
+    """Near pairs, padded to whole ``LANES``, with a spare slot for a pair beyond the capacity."""
 
-    ends: (2, slots), grains.
-    images: (2, slots).
-    calendar: (3, slots), steps.
-    bounds: (2, blocks), the least strike and begin of a block of the calendar, or less.
-    of_grain: (2 capacity,), pairs of the grains, those of grain g at
-      ``offsets[g] : offsets[g + 1]``.
-    starts, cells, sorted: for the search, (cells + 1,), the cell of each grain, and the grains in
-      the order of the cells.
-    places: (3, grains), x, y and radius of these.
-    listed: (slots,), pairs to be predicted.
-    flights, entries: (5, LANES) and (3, LANES), scratch memory of a prediction.
-    """
-
-    ends: Any
-    images: Any
-    calendar: Any
-    bounds: Any
-    of_grain: Any
+    ends: Any  # (2, slots), grains
+    images: Any  # (2, slots)
+    calendar: Any  # (3, slots), steps
+    bounds: Any  # (2, blocks), the least strike and begin of a block of the calendar, or less
+    of_grain: Any  # pairs of the grains, those of grain g at ``offsets[g] : offsets[g + 1]``
     offsets: Any
-    starts: Any
-    cells: Any
-    sorted: Any
-    places: Any
-    listed: Any
-    flights: Any
-    entries: Any
+    starts: Any  # (cells + 1,), for the search
+    cells: Any  # (grains,), the cell of each grain
+    sorted: Any  # (grains,), in the order of the cells
+    places: Any  # (3, grains), x, y and radius of these
+    listed: Any  # (slots,), pairs to be predicted
+    flights: Any  # (5, LANES), memory of a prediction
+    entries: Any  # (3, LANES), memory of a prediction
 
 
 class Network(NamedTuple):
-    """The contacts of one step and the grains that they touch.
+    """The contacts of one step and the grains that they touch."""
 
-    near_pair: (contacts,), the pair of each contact.
-    ends: (2, contacts), grains.
-    rows: (5, contacts).
-    touched: (grains,), the grains with contacts.
-    degree, loaded: (grains,), contacts of each grain, and those with an impulse.
-    impulses: (grains, 2), total impulse of each grain.
-    """
-
-    near_pair: Any
-    ends: Any
-    rows: Any
-    touched: Any
-    degree: Any
-    loaded: Any
-    impulses: Any
+    near_pair: Any  # (contacts,), the pair of each contact
+    ends: Any  # (2, contacts), grains
+    rows: Any  # (5, contacts)
+    touched: Any  # the grains with contacts
+    degree: Any  # (grains,), contacts of each grain
+    loaded: Any  # (grains,), those with an impulse
+    impulses: Any  # (grains, 2), total impulse of each grain
 
 
 class Clusters(NamedTuple):
-    """Contacts that touch each other, sorted by cluster, and the memory of their solver.
+    """Contacts that touch each other, sorted by cluster, and the memory of their solver."""
 
-    source: (contacts,), indices in the network; those of cluster m at
-      ``starts[m] : starts[m + 1]``.
-    of_grain: (2 contacts,), contacts of the grains, those of grain g from ``offsets[g]`` on.
-    queue, reached: (grains,), for the search for clusters.
-
-    Of the cluster that is solved:
-
-    places: (contacts,), indices in the network.
-    ends: (contacts, 2), grains.
-    rows: (contacts, 8).
-    iterate: (contacts, 5), for the method of Barzilai and Borwein.
-    dv: (grains, 2), changes of velocity.
-    matrices: (grains, 3), Σ n ⊗ n.
-    """
-
-    source: Any
+    source: Any  # indices in the network, those of cluster m at ``starts[m] : starts[m + 1]``
     starts: Any
-    of_grain: Any
+    of_grain: Any  # contacts of the grains, those of grain g from ``offsets[g]`` on
     offsets: Any
-    queue: Any
-    reached: Any
-    places: Any
-    ends: Any
-    rows: Any
-    iterate: Any
-    dv: Any
-    matrices: Any
+    queue: Any  # (grains,), of the search for clusters
+    reached: Any  # (grains,), of the search for clusters
+    # of the cluster that is solved
+    places: Any  # (contacts,), indices in the network
+    ends: Any  # (contacts, 2), grains
+    rows: Any  # (contacts,) of ``CONTACT``
+    iterate: Any  # (contacts,) of ``ITERATE``
+    dv: Any  # (grains, 2), changes of velocity
+    matrices: Any  # (grains, 3), Σ n ⊗ n
 
 
 class Arrays(NamedTuple):
@@ -127,7 +101,7 @@ def arrays_of(count):
     """All arrays for ``count`` grains, as they are before the first step."""
     network = _network_of(count)
     return Arrays(
-        Grains(np.empty((count, 4)), np.empty((count, 2)), np.empty(count, np.uint32)),
+        Grains(np.empty(count, MOTION), np.empty(count, CONSTANTS), np.empty(count, np.uint32)),
         _pairs_of(count),
         network,
         _clusters_of(count, network.impulses),  # summed after the solves
@@ -184,8 +158,8 @@ def _clusters_of(count, dv):
         reached=np.zeros(count, np.int32),
         places=np.empty(size, np.uint32),
         ends=np.empty((size, 2), np.uint32),
-        rows=np.empty((size, 8)),
-        iterate=np.empty((size, 5)),
+        rows=np.empty(size, CONTACT),
+        iterate=np.empty(size, ITERATE),
         dv=dv,
         matrices=np.empty((count, 3)),
     )

@@ -22,13 +22,8 @@ from jaxgran.dynamics.numba_engine.layout import (
     LEAST_SHIFT,
     MANY,
     NEVER,
-    RADIUS,
     SECOND,
     STRIKES,
-    VX,
-    VY,
-    X,
-    Y,
 )
 
 gap_coefficients, gap_discriminant = LAW["gap_coefficients"], LAW["gap_discriminant"]
@@ -48,9 +43,9 @@ def pair_motion(p, t, flow, grains, pairs):
     motion, images = grains.motion, pairs.images
     i, j = pairs.ends[FIRST, p], pairs.ends[SECOND, p]
     up = images[IMAGE_ROW, p] * flow.side
-    ux, uy = motion[i, VX] - motion[j, VX] - flow.shear_rate * up, motion[i, VY] - motion[j, VY]
-    dx = motion[i, X] - motion[j, X] - images[IMAGE_X, p] + ux * t
-    dy = motion[i, Y] - motion[j, Y] - up + uy * t
+    ux, uy = motion[i].vx - motion[j].vx - flow.shear_rate * up, motion[i].vy - motion[j].vy
+    dx = motion[i].x - motion[j].x - images[IMAGE_X, p] + ux * t
+    dy = motion[i].y - motion[j].y - up + uy * t
     return i, j, dx, dy, ux, uy
 
 
@@ -70,7 +65,7 @@ def predict_contact_steps(count, t, earliest, horizon, shift, flow, grains, pair
         for n in range(size):
             i, j, dx, dy, ux, uy = pair_motion(listed[start + n], t, flow, grains, pairs)
             flights[0, n], flights[1, n], flights[2, n], flights[3, n] = dx, dy, ux, uy
-            flights[4, n] = grains.constants[i, RADIUS] + grains.constants[j, RADIUS]
+            flights[4, n] = grains.constants[i].radius + grains.constants[j].radius
         for n in range((size + _TOGETHER - 1) // _TOGETHER * _TOGETHER):
             strikes, begins, ends = _contact_steps(
                 flights[0, n],

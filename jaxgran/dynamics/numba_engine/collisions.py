@@ -9,14 +9,9 @@ from jaxgran.dynamics.numba_engine.compilation import LAW, njit
 from jaxgran.dynamics.numba_engine.layout import (
     EPSILON,
     FIRST,
-    INVERSE_MASS,
     OK,
     SECOND,
     STRIKES,
-    VX,
-    VY,
-    X,
-    Y,
 )
 from jaxgran.dynamics.numba_engine.network import (
     find_clusters,
@@ -85,19 +80,19 @@ def strike(touched_count, t, shear_rate, grains, network, clusters, kinetic, max
         g = touched[n]
         network.degree[g], clusters.reached[g] = 0, 0
         px, py = impulses[g, 0], impulses[g, 1]
-        dvx, dvy = px * constants[g, INVERSE_MASS], py * constants[g, INVERSE_MASS]
+        dvx, dvy = px * constants[g].inverse_mass, py * constants[g].inverse_mass
         if dvx != 0.0 or dvy != 0.0:
-            cx, cy = motion[g, VX] - shear_rate * (motion[g, Y] + motion[g, VY] * t), motion[g, VY]
+            cx, cy = motion[g].vx - shear_rate * (motion[g].y + motion[g].vy * t), motion[g].vy
             xx += px * (2 * cx + dvx)
             xy += px * cy + py * cx + px * dvy
             yy += py * (2 * cy + dvy)
             speed = math.sqrt((cx + dvx) * (cx + dvx) + (cy + dvy) * (cy + dvy))
             finite &= speed < math.inf
             max_speed = max(max_speed, speed)
-            motion[g, VX] += dvx
-            motion[g, VY] += dvy
-            motion[g, X] -= dvx * t
-            motion[g, Y] -= dvy * t
+            motion[g].vx += dvx
+            motion[g].vy += dvy
+            motion[g].x -= dvx * t
+            motion[g].y -= dvy * t
     return (xx, xy, yy), max_speed, finite
 
 

@@ -75,13 +75,13 @@ def _register() -> None:
     handler = compiled_handler(engine_folder())
     words = (ctypes.c_int64 * SHARED_WORDS).from_address(handler.ctypes(0))
     words[THREADS], words[HANDLER] = usable_threads(), handler.address
-    _SHARED.append(words)
     try:
         jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(handler.address), platform="cpu")
     except jax.errors.JaxRuntimeError as error:
         raise InputError(
             f"engine must be jax with jaxlib {version('jaxlib')}, not numba: {error}"
         ) from error
+    _SHARED.append(words)
 
 
 def shared_words() -> Any:

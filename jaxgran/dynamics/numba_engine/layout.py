@@ -41,19 +41,11 @@ INPUT_NUMBERS = len(Inputs._fields)
 STATUS, TILT, UNFINISHED, RECORDED, SOLVED, READ, KINETIC, DRIFT = range(NUMBERS, NUMBERS + 8)
 RESULTS = NUMBERS + 8
 
-X, Y, VX, VY = range(4)  # columns of the motion of the grains
-RADIUS, INVERSE_MASS = range(2)  # columns of the grains
 FIRST, SECOND = range(2)  # rows of the ends of a pair, and of a contact
 WAITING, DONE = 1, 2  # of a grain in the search for clusters; 0 before it is reached
 IMAGE_X, IMAGE_ROW = range(2)  # rows of the images: r_i − r_j − (x, row·ℓ) is the separation
 STRIKES, BEGINS, ENDS = range(3)  # rows of the calendar, in steps since the search
 NX, NY, APPROACH, DISTANCE, IMPULSE = range(5)  # rows of the network
-# Columns of a contact in the solver: μ n, μ u⁻, 1/μ, 1/(μ m_i), 1/(μ m_j) and J, with the reduced
-# mass μ
-MU_NX, MU_NY, MU_U, INVERSE_MU, INVERSE_MU_MI, INVERSE_MU_MJ, J = range(7)
-# Columns of a contact in the method of Barzilai and Borwein: W J, the last changes of J and of W J,
-# J of the best iterate, and the diagonal D
-RESPONSE, STEP, RESPONSE_CHANGE, BEST, BOUND = range(5)
 # Columns of a record; behind this head its grains, then its contacts
 RECORD_STEP, RECORD_SOLVED, RECORD_CONTACTS, RECORD_TILT, RECORD_HEAD = range(5)
 # Columns of a recorded grain and of a recorded contact, and how many these are

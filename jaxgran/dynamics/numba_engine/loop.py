@@ -38,7 +38,6 @@ from jaxgran.dynamics.numba_engine.layout import (
     DRIFT,
     EPSILON,
     FAILED,
-    INVERSE_MASS,
     KINETIC,
     MANY,
     NONFINITE,
@@ -51,10 +50,7 @@ from jaxgran.dynamics.numba_engine.layout import (
     STOP,
     TILT,
     UNFINISHED,
-    VX,
-    VY,
     Flow,
-    Y,
 )
 from jaxgran.dynamics.numba_engine.motion import (
     bring_into_cell,
@@ -292,9 +288,9 @@ def _end_block(t, tilt, side, shear_rate, kinetic, status, grains, clusters, ste
     motion, constants = grains.motion, grains.constants
     read_velocity_scales(t, tilt, side, shear_rate, grains, clusters.matrices, step_sums, sums)
     px = py = total = 0.0
-    for g in range(motion.shape[0]):
-        cx, cy = motion[g, VX] - shear_rate * (motion[g, Y] + motion[g, VY] * t), motion[g, VY]
-        mass = 1 / constants[g, INVERSE_MASS]
+    for g in range(motion.size):
+        cx, cy = motion[g].vx - shear_rate * (motion[g].y + motion[g].vy * t), motion[g].vy
+        mass = 1 / constants[g].inverse_mass
         px += mass * cx
         py += mass * cy
         total += mass * math.sqrt(cx * cx + cy * cy)

@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from jaxgran.dynamics.numba_engine.compilation import CELL, njit, whole_part
-from jaxgran.dynamics.numba_engine.layout import INVERSE_MASS, RADIUS, VX, VY, X, Y
 
 image_in_cell = CELL["image_in_cell"]
 
@@ -47,13 +46,13 @@ def read_state(positions, velocities, radii, masses, shear_rate, grains):
     largest_diameter, finite = 0.0, True
     for g in range(in_state.size):
         n = in_state[g]
-        motion[g, X], motion[g, Y] = positions[n, 0], positions[n, 1]
-        motion[g, VX] = velocities[n, 0] + shear_rate * positions[n, 1]
-        motion[g, VY] = velocities[n, 1]
-        constants[g, RADIUS], constants[g, INVERSE_MASS] = radii[n], 1 / masses[n]
+        motion[g].x, motion[g].y = positions[n, 0], positions[n, 1]
+        motion[g].vx = velocities[n, 0] + shear_rate * positions[n, 1]
+        motion[g].vy = velocities[n, 1]
+        constants[g].radius, constants[g].inverse_mass = radii[n], 1 / masses[n]
         largest_diameter = max(largest_diameter, 2 * radii[n])
-        for a in range(4):
-            finite &= abs(motion[g, a]) < math.inf
+        finite &= abs(motion[g].x) < math.inf and abs(motion[g].y) < math.inf
+        finite &= abs(motion[g].vx) < math.inf and abs(motion[g].vy) < math.inf
     return largest_diameter, finite
 
 
@@ -64,13 +63,13 @@ def bring_into_cell(grains, side, tilt, shear_rate):
     """
     motion = grains.motion
     squared_speed = 0.0
-    for g in range(motion.shape[0]):
-        cx, cy = motion[g, VX] - shear_rate * motion[g, Y], motion[g, VY]
-        row = np.floor(motion[g, Y] / side)
-        motion[g, Y] -= row * side
-        motion[g, X] -= row * tilt * side
-        motion[g, X] -= np.floor((motion[g, X] - tilt * motion[g, Y]) / side) * side
-        motion[g, VX] = cx + shear_rate * motion[g, Y]
+    for g in range(motion.size):
+        cx, cy = motion[g].vx - shear_rate * motion[g].y, motion[g].vy
+        row = np.floor(motion[g].y / side)
+        motion[g].y -= row * side
+        motion[g].x -= row * tilt * side
+        motion[g].x -= np.floor((motion[g].x - tilt * motion[g].y) / side) * side
+        motion[g].vx = cx + shear_rate * motion[g].y
         squared_speed = max(squared_speed, cx * cx + cy * cy)
     return math.sqrt(squared_speed)
 
@@ -80,9 +79,9 @@ def kinetic_sums(grains, shear_rate):
     """Σ m c_x c_x, Σ m c_x c_y and Σ m c_y c_y, just after a search."""
     motion, constants = grains.motion, grains.constants
     xx = xy = yy = 0.0
-    for g in range(motion.shape[0]):
-        cx, cy = motion[g, VX] - shear_rate * motion[g, Y], motion[g, VY]
-        mass = 1 / constants[g, INVERSE_MASS]
+    for g in range(motion.size):
+        cx, cy = motion[g].vx - shear_rate * motion[g].y, motion[g].vy
+        mass = 1 / constants[g].inverse_mass
         xx += mass * cx * cx
         xy += mass * cx * cy
         yy += mass * cy * cy
@@ -93,29 +92,29 @@ def kinetic_sums(grains, shear_rate):
 def move_grains(t, grains):
     """Move the grains to their positions at the time t since the search."""
     motion = grains.motion
-    for g in range(motion.shape[0]):
-        motion[g, X] += motion[g, VX] * t
-        motion[g, Y] += motion[g, VY] * t
+    for g in range(motion.size):
+        motion[g].x += motion[g].vx * t
+        motion[g].y += motion[g].vy * t
 
 
 @njit
 def write_state(side, tilt, shear_rate, grains, new_positions, new_velocities):
     """Write the positions, in the cell, and the peculiar velocities of the grains."""
     motion = grains.motion
-    for g in range(motion.shape[0]):
+    for g in range(motion.size):
         n = grains.in_state[g]
         new_positions[n, 0], new_positions[n, 1] = image_in_cell(
-            motion[g, X], motion[g, Y], side, tilt
+            motion[g].x, motion[g].y, side, tilt
         )
-        new_velocities[n, 0] = motion[g, VX] - shear_rate * motion[g, Y]
-        new_velocities[n, 1] = motion[g, VY]
+        new_velocities[n, 0] = motion[g].vx - shear_rate * motion[g].y
+        new_velocities[n, 1] = motion[g].vy
 
 
 @njit
 def write_motion(grains, new_positions, new_velocities):
     """Write the positions as they are, and the velocities in the laboratory."""
     motion = grains.motion
-    for g in range(motion.shape[0]):
+    for g in range(motion.size):
         n = grains.in_state[g]
-        new_positions[n, 0], new_positions[n, 1] = motion[g, X], motion[g, Y]
-        new_velocities[n, 0], new_velocities[n, 1] = motion[g, VX], motion[g, VY]
+        new_positions[n, 0], new_positions[n, 1] = motion[g].x, motion[g].y
+        new_velocities[n, 0], new_velocities[n, 1] = motion[g].vx, motion[g].vy

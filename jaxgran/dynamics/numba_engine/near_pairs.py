@@ -9,10 +9,7 @@ from jaxgran.dynamics.numba_engine.layout import (
     FIRST,
     IMAGE_ROW,
     IMAGE_X,
-    RADIUS,
     SECOND,
-    X,
-    Y,
 )
 
 nearest_image = CELL["nearest_image"]
@@ -72,22 +69,22 @@ def _sort_into_cells(grains, pairs, side, tilt, rows, columns):
     starts, cells, sorted_grains, places = pairs.starts, pairs.cells, pairs.sorted, pairs.places
     for cell in range(rows * columns + 1):
         starts[cell] = 0
-    for g in range(motion.shape[0]):
-        row = whole_part(motion[g, Y] / side * rows, rows - 1)
-        fraction = (motion[g, X] - tilt * motion[g, Y]) / side
+    for g in range(motion.size):
+        row = whole_part(motion[g].y / side * rows, rows - 1)
+        fraction = (motion[g].x - tilt * motion[g].y) / side
         cells[g] = row * columns + whole_part(fraction * columns, columns - 1)
         starts[cells[g] + 1] += 1
     for cell in range(rows * columns):
         starts[cell + 1] += starts[cell]
     # A cell is filled from its end, which moves to its beginning
-    for g in range(motion.shape[0] - 1, -1, -1):
+    for g in range(motion.size - 1, -1, -1):
         starts[cells[g] + 1] -= 1
         n = starts[cells[g] + 1]
         sorted_grains[n] = g
-        places[0, n], places[1, n], places[2, n] = motion[g, X], motion[g, Y], constants[g, RADIUS]
+        places[0, n], places[1, n], places[2, n] = motion[g].x, motion[g].y, constants[g].radius
     for cell in range(rows * columns):
         starts[cell] = starts[cell + 1]
-    starts[rows * columns] = motion.shape[0]
+    starts[rows * columns] = motion.size
 
 
 @njit
@@ -141,13 +138,13 @@ def _pairs_of_all(grains, pairs, side, tilt, skin, capacity):
     """Compare all pairs by nearest images, in a periodic cell too small for a grid of 3×3."""
     motion, constants, ends, images = grains.motion, grains.constants, pairs.ends, pairs.images
     count = 0
-    for i in range(motion.shape[0]):
+    for i in range(motion.size):
         for j in range(i):
-            dx, dy = motion[i, X] - motion[j, X], motion[i, Y] - motion[j, Y]
+            dx, dy = motion[i].x - motion[j].x, motion[i].y - motion[j].y
             column, row = nearest_image(dx, dy, side, tilt)
             image_x = column * side + row * tilt * side
             dx, dy = dx - image_x, dy - row * side
-            reach = constants[i, RADIUS] + constants[j, RADIUS] + skin
+            reach = constants[i].radius + constants[j].radius + skin
             if dx * dx + dy * dy <= reach * reach:
                 if count < capacity:
                     ends[FIRST, count], ends[SECOND, count] = i, j

@@ -10,10 +10,8 @@ from jaxgran.dynamics.numba_engine.layout import (
     DONE,
     FIRST,
     IMPULSE,
-    INVERSE_MASS,
     NX,
     NY,
-    RADIUS,
     SECOND,
     WAITING,
 )
@@ -35,9 +33,7 @@ def make_network(contacts, t, flow, grains, pairs, network):
         ends[FIRST, c], ends[SECOND, c] = i, j
         rows[NX, c], rows[NY, c], rows[APPROACH, c] = dx, dy, approach
         rows[DISTANCE, c], rows[IMPULSE, c] = distance, 0.0
-        largest_overlap = max(
-            largest_overlap, constants[i, RADIUS] + constants[j, RADIUS] - distance
-        )
+        largest_overlap = max(largest_overlap, constants[i].radius + constants[j].radius - distance)
         scale += min(approach, 0.0) * approach
         for end in range(2):
             g = ends[end, c]
@@ -56,7 +52,7 @@ def solve_isolated(contacts, grains, network):
     for c in range(contacts):
         i, j = ends[FIRST, c], ends[SECOND, c]
         if degree[i] == 1 and degree[j] == 1:
-            mobility = constants[i, INVERSE_MASS] + constants[j, INVERSE_MASS]
+            mobility = constants[i].inverse_mass + constants[j].inverse_mass
             rows[IMPULSE, c] = max(0.0, -rows[APPROACH, c]) / mobility
         else:
             coupled += 1

@@ -26,10 +26,8 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 
-_MOST_ROOM, _LEAST_ROOM = (
-    64,
-    2,
-)  # records of one call; the least are those of a list and of its first contacts
+_MOST_ROOM = 320  # records of one call; usual lists have some 10 to 300, mostly of small time steps
+_LEAST_ROOM = 2  # those of a list and of its first contacts
 _MOST_BYTES = 2**26  # of the records of one call, above 170,000 grains those of the least
 _STEPS = place_of("steps")
 _FEW = 16  # grains for a slot in the smaller one of two buffers for contacts

@@ -23,10 +23,6 @@ from jaxgran.dynamics.numba_engine.layout import (
     RECORD_STEP,
     RECORD_TILT,
     SECOND,
-    VX,
-    VY,
-    X,
-    Y,
 )
 
 remap_tilt = CELL["remap_tilt"]
@@ -42,9 +38,9 @@ def record_flight(record, step, solved, tilt, t, shear_rate, grains):
     record[RECORD_TILT] = remap_tilt(tilt)
     for g in range(in_state.size):
         at = RECORD_HEAD + RECORD_OF_GRAIN * in_state[g]
-        y = motion[g, Y] + motion[g, VY] * t
-        record[at], record[at + 1] = motion[g, X] + motion[g, VX] * t, y
-        record[at + 2], record[at + 3] = motion[g, VX] - shear_rate * y, motion[g, VY]
+        y = motion[g].y + motion[g].vy * t
+        record[at], record[at + 1] = motion[g].x + motion[g].vx * t, y
+        record[at + 2], record[at + 3] = motion[g].vx - shear_rate * y, motion[g].vy
 
 
 @njit

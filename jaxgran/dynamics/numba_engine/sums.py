@@ -8,11 +8,9 @@ from jaxgran.dynamics.numba_engine.layout import (
     DISTANCE,
     FIRST,
     IMPULSE,
-    INVERSE_MASS,
     NX,
     NY,
     OK,
-    RADIUS,
     SECOND,
 )
 from jaxgran.dynamics.tally import CONTACT, place_of, span_of
@@ -59,7 +57,7 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
     for c in range(contacts):
         i, j = ends[FIRST, c], ends[SECOND, c]
         nx, ny, approach, distance = rows[NX, c], rows[NY, c], rows[APPROACH, c], rows[DISTANCE, c]
-        mi, mj = constants[i, INVERSE_MASS], constants[j, INVERSE_MASS]
+        mi, mj = constants[i].inverse_mass, constants[j].inverse_mass
         impulse = one_plus_alpha * rows[IMPULSE, c]
         change = nx * (impulses[i, 0] * mi - impulses[j, 0] * mj) + ny * (
             impulses[i, 1] * mi - impulses[j, 1] * mj
@@ -68,7 +66,7 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
             nx,
             ny,
             distance,
-            max(constants[i, RADIUS] + constants[j, RADIUS] - distance, 0.0),
+            max(constants[i].radius + constants[j].radius - distance, 0.0),
             approach,
             change / 2,
             one_plus_alpha,
