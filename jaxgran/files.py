@@ -1,10 +1,9 @@
-"""Atomic writes, file locks, and cache files with a checksum.
+"""Atomic writes and file locks.
 
 A file is written under a temporary name in its final folder, synced, and renamed. A killed process
 leaves either the old file or the new one, never a part of one.
 """
 
-import hashlib
 import os
 import secrets
 import shutil
@@ -16,8 +15,6 @@ try:
     import fcntl
 except ImportError:  # a system without file locks: every process writes the file
     fcntl = None
-
-_DIGEST = hashlib.sha256().digest_size  # bytes
 
 
 @contextmanager
@@ -100,30 +97,6 @@ def is_locked(path: Path, handle: int | None) -> bool:
         return handle is None or os.path.samestat(os.fstat(handle), path.stat())
     except OSError:
         return False
-
-
-def write_cached(path: Path, content: bytes, most: int) -> None:
-    """Write a cache file, then remove the oldest files with its suffix beyond the newest ``most``.
-
-    Raises:
-      OSError: the folder cannot be created or written to.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(content + hashlib.sha256(content).digest())
-    with suppress(OSError):
-        files = path.parent.glob(f"*{path.suffix}")
-        for old in sorted(files, key=lambda file: file.stat().st_mtime)[:-most]:
-            old.unlink(missing_ok=True)
-
-
-def read_cached(path: Path) -> bytes | None:
-    """The content of a cache file; None if it is missing or damaged."""
-    with suppress(OSError):
-        stored = path.read_bytes()
-        content, digest = stored[:-_DIGEST], stored[-_DIGEST:]
-        return content if hashlib.sha256(content).digest() == digest else None
-    return None
 
 
 def other_version(name: str, stored: object, version: int | str) -> str:

@@ -7,7 +7,8 @@ import pytest
 from numba import njit
 
 from jaxgran.dynamics.numba_engine import calendar
-from jaxgran.dynamics.numba_engine.layout import BEGINS, LANES, LEAST_SHIFT, NEVER, STRIKES, Pairs
+from jaxgran.dynamics.numba_engine.arrays import Pairs
+from jaxgran.dynamics.numba_engine.layout import BEGINS, LANES, LEAST_SHIFT, NEVER, STRIKES
 
 ENTRIES, CHANGES = 37 * LANES, 9
 

@@ -25,7 +25,7 @@ FLOW = ShearFlow(GRAINS, 0.7, 0.7, 1e-3)
 def test_machine_code_that_is_stopped_ends_as_failed_and_runs_again(engines, flowing) -> None:
     advance, state = engines["numba"], flowing(0.7)
     end, whole = advance(FLOW, state, 1000, BarzilaiBorwein())
-    with ffi.stopped():
+    with ffi.engines_stopped():
         _, cut = advance(FLOW, state, 1000, BarzilaiBorwein())
     assert cut.status == Status.failed and cut.steps < 1000
     again, tally = advance(FLOW, state, 1000, BarzilaiBorwein())

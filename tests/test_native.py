@@ -30,8 +30,8 @@ from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics import advance as advance_module
 from jaxgran.dynamics import step
 from jaxgran.dynamics.engine import Jax, Numba, engine_named
-from jaxgran.dynamics.numba_engine import cluster_solver, layout
-from jaxgran.dynamics.numba_engine.ffi import object_file
+from jaxgran.dynamics.numba_engine import arrays, cluster_solver
+from jaxgran.dynamics.numba_engine.ffi import engine_folder
 from jaxgran.dynamics.numba_engine.near_pairs import LIFE, closing_speed_bound, find_near_pairs
 from jaxgran.dynamics.step import LONGEST_FLIGHT
 from jaxgran.dynamics.tally import TABLE
@@ -389,7 +389,7 @@ def near_pairs_found():
     engine is the same.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(numba.config, "CACHE_DIR", str(object_file().with_suffix("")))
+        patch.setattr(numba.config, "CACHE_DIR", str(engine_folder()))
         return numba.njit(cache=True)(find_near_pairs.py_func)
 
 
@@ -409,9 +409,10 @@ def test_near_pairs_are_those_of_all_images(
     side = np.sqrt(np.pi * np.sum(radii**2) / packing_fraction)
     reach = 2 * radii.max() + skin
     assume(reach <= side / 2)  # nearest images are unique
-    motion = np.zeros((count, 4))
-    motion[:, :2] = rng.uniform(0, side, (count, 2))
-    motion[:, 0] -= np.floor((motion[:, 0] - tilt * motion[:, 1]) / side) * side
+    positions = rng.uniform(0, side, (count, 2))
+    positions[:, 0] -= np.floor((positions[:, 0] - tilt * positions[:, 1]) / side) * side
+    motion, constants = np.zeros(count, arrays.MOTION), np.ones(count, arrays.CONSTANTS)
+    motion["x"], motion["y"], constants["radius"] = *positions.T, radii
     room = count * (count - 1) // 2
     cells = (
         np.empty(max(9, 2 * count) + 1, np.uint32),
@@ -419,15 +420,15 @@ def test_near_pairs_are_those_of_all_images(
         np.empty((3, count)),
     )
     listed = np.empty((2, room + 1), np.uint32), np.empty((2, room + 1))
-    memory = layout.Pairs(*listed, *4 * [None], *cells, *3 * [None])
-    grains = layout.Grains(motion, np.stack([radii, np.ones(count)], axis=-1))
+    memory = arrays.Pairs(*listed, *4 * [None], *cells, *3 * [None])
+    grains = arrays.Grains(motion, constants, None)
     found = near_pairs_found(grains, memory, side, tilt, reach, skin, room)
     pairs, images = memory.ends, memory.images
     expected = set()
     for row in (-1, 0, 1):
         for column in (-2, -1, 0, 1, 2):
             shift = np.array([(column + row * tilt) * side, row * side])
-            apart = motion[:, None, :2] - motion[None, :, :2] - shift
+            apart = positions[:, None] - positions[None, :] - shift
             near = np.hypot(*np.moveaxis(apart, -1, 0)) <= radii[:, None] + radii[None, :] + skin
             expected |= {(i, j, row, column) for i, j in np.argwhere(near) if i < j}
     across = np.round(images[0, :found] / side - images[1, :found] * tilt).astype(int)

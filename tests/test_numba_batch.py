@@ -11,6 +11,7 @@ from flows import GRAINS
 
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.numba_engine import ffi
+from jaxgran.dynamics.numba_engine.layout import THREADS
 from jaxgran.environment import usable_cores, usable_threads
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.sampler import sample
@@ -21,9 +22,9 @@ RESTITUTIONS, FRACTIONS, STEPS = (0.3, 0.7, 0.9), (0.6, 0.7), 500
 @pytest.fixture(params=[1, 2, 8])
 def threads(request) -> Iterator[int]:
     ffi.register()
-    ffi.set_word(ffi.THREADS, request.param)
+    ffi.shared_words()[THREADS] = request.param
     yield request.param
-    ffi.set_word(ffi.THREADS, usable_threads())
+    ffi.shared_words()[THREADS] = usable_threads()
 
 
 def advanced(restitution, fraction, state):

@@ -1,15 +1,18 @@
-"""The numba engine: a file for each version of its sources, and blocks of steps that are those of
+"""The numba engine: a cache for each version of its sources, and blocks of steps that are those of
 one call each.
 """
 
 import os
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import jaxlib
+import numba
 import numpy as np
 import pytest
 from flows import GRAINS
@@ -19,9 +22,9 @@ from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.engine import Numba
 from jaxgran.dynamics.numba_engine import ffi, handler
 from jaxgran.dynamics.tally import TABLE
-from jaxgran.files import read_cached, write_cached
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.status import Status
 
 PACKAGE = Path(jaxgran.__file__).parent
 
@@ -42,14 +45,14 @@ def of_copy(copy: Path, monkeypatch) -> Path:
     return copy
 
 
-def test_any_change_of_any_source_gives_the_machine_code_another_file(of_copy: Path) -> None:
-    kept, sources = ffi.object_file(), ffi.sources()
+def test_any_change_of_any_source_gives_the_machine_code_another_folder(of_copy: Path) -> None:
+    kept, sources = ffi.engine_folder(), ffi.sources()
     for path in sources:
         content = path.read_bytes()
         path.write_bytes(content + b"\n")
-        assert ffi.object_file() != kept
+        assert ffi.engine_folder() != kept
         path.write_bytes(content)
-    assert ffi.object_file() == kept
+    assert ffi.engine_folder() == kept
     compiled_here = {*(of_copy / "jaxgran" / "dynamics" / "numba_engine").glob("*.py")}
     imported = {
         of_copy / "jaxgran" / name
@@ -58,38 +61,68 @@ def test_any_change_of_any_source_gives_the_machine_code_another_file(of_copy: P
     assert compiled_here and compiled_here | imported <= set(sources)
 
 
-def test_another_compiler_or_processor_has_another_file(monkeypatch) -> None:
-    kept = {ffi.object_file()}
-    for module, name, value in (
-        (ffi, "version", lambda _: "0.0.1"),
-        (ffi.llvm, "get_host_cpu_name", lambda: "another"),
-    ):
-        with monkeypatch.context() as patch:
-            patch.setattr(module, name, value)
-            kept.add(ffi.object_file())
-    monkeypatch.setenv("NUMBA_OPT", "2")
-    kept.add(ffi.object_file())
-    assert len(kept) == 4
+class Compiled:
+    """A handler that was compiled, and not loaded."""
+
+    cache_hits = 0
 
 
-def test_a_kept_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
-    path, content = tmp_path / "cache" / "code.o", b"numba engine" * 100
-    assert read_cached(path) is None
-    write_cached(path, content, 1)
-    assert read_cached(path) == content
-    assert [file.name for file in path.parent.iterdir()] == ["code.o"]
-    whole = path.read_bytes()
-    for torn in (b"", whole[:20], whole[:-1], whole[:500] + b"!" + whole[501:]):
-        path.write_bytes(torn)
-        assert read_cached(path) is None
+def test_only_some_versions_are_kept_and_the_oldest_go(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(numba, "cfunc", lambda *_, **__: lambda _: Compiled)
+    for k in range(ffi.MOST_KEPT + 2):
+        (tmp_path / f"jaxgran-{k:016}").mkdir()
+        os.utime(tmp_path / f"jaxgran-{k:016}", (k, k))
+    (tmp_path / "of-another-program").mkdir()
+    before = numba.config.CACHE_DIR
+    assert ffi.compiled_handler(tmp_path / "jaxgran-0000000000000009") is Compiled
+    assert before == numba.config.CACHE_DIR
+    kept = {path.name for path in tmp_path.iterdir()} - {"of-another-program"}
+    assert kept == {f"jaxgran-{k + 2:016}" for k in range(ffi.MOST_KEPT)}
+    assert (tmp_path / "of-another-program").exists()
 
 
-def test_only_some_files_are_kept_and_the_oldest_go(tmp_path: Path) -> None:
-    for k in range(5):
-        write_cached(tmp_path / f"{k}.o", b"code", 3)
-        os.utime(tmp_path / f"{k}.o", (k, k))
-    write_cached(tmp_path / "last.o", b"code", 3)
-    assert {path.name for path in tmp_path.iterdir()} == {"last.o", "3.o", "4.o"}
+def test_a_folder_that_cannot_be_written_compiles_without_a_cache(
+    tmp_path: Path, monkeypatch
+) -> None:
+    given = []
+    monkeypatch.setattr(
+        numba, "cfunc", lambda *_, cache, **__: lambda _: given.append(cache) or Compiled
+    )
+    (tmp_path / "file").touch()
+    with pytest.warns(UserWarning, match="compiled anew in every process"):
+        ffi.compiled_handler(tmp_path / "file" / "jaxgran-0")
+    assert given == [False]
+
+
+FIRST_STEPS = """
+import hashlib
+import jax
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
+import jaxgran as jg
+from jaxgran.dynamics import interruption
+
+flow = jg.ShearFlow(16, 0.5, 0.6, 1e-3)
+blocks = jax.tree.leaves(jg.sample(flow, jg.heated(flow, jax.random.key(0)), 0.4)[1].tally)
+with interruption.engines_stopped():
+    stopped = jg.advance(flow, jg.heated(flow, jax.random.key(0)), jnp.int32(100))[1]
+print(int(stopped.status), hashlib.sha256(b"".join(x.tobytes() for x in blocks)).hexdigest())
+"""
+
+
+@pytest.mark.environment
+def test_processes_that_compile_and_one_that_loads_have_the_same_bits(tmp_path: Path) -> None:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+
+    def start() -> subprocess.Popen:
+        command = [sys.executable, "-c", FIRST_STEPS]
+        return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+    at_once = [start(), start()]
+    printed = [process.communicate()[0] for process in at_once]
+    printed.append(start().communicate()[0])
+    assert len(set(printed)) == 1 and printed[0].startswith(f"{Status.failed:d} ")
+    assert len(list(tmp_path.rglob("*.nbc"))) == 1
 
 
 def words(structure: str) -> dict[str, int]:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flows import GRAINS
+from flows import COUNTS, GRAINS, assert_same_state
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.advance import advance
@@ -116,19 +116,21 @@ def test_error_of_a_ratio_is_that_of_the_ratio(observed) -> None:
 
 
 def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monkeypatch) -> None:
-    """With room for three, the numba engine is suspended after every other step with contacts, and
-    takes none twice.
+    """With room for three, a call of the numba engine ends after every other step with contacts,
+    and none is taken twice.
     """
     monkeypatch.setattr(records, "_MOST_ROOM", 3)
     steps = jnp.int32(320)
-    state, tally = jax.jit(lambda state: advance(FLOW, state, steps, observe))(flowing(0.7))
-    own, tally = tally.observed, replace(tally, observed=None)
-    plain = jax.jit(lambda state: advance(FLOW, state, steps))(flowing(0.7))
-    jax.tree.map(np.testing.assert_array_equal, (state, tally), plain)
+    end, tally = jax.jit(lambda state: advance(FLOW, state, steps, observe))(flowing(0.7))
+    own = tally.observed
+    plain_end, plain = jax.jit(lambda state: advance(FLOW, state, steps))(flowing(0.7))
+    assert_same_state(end, plain_end, 1e-9)
+    for name in COUNTS:
+        assert getattr(tally, name) == getattr(plain, name), name
     assert tally.solves == jnp.sum(observed[1].tally.solves) > 50
     assert own["one"] == own["inside"] == tally.steps == 320
     np.testing.assert_allclose(
-        own["stress"] * FLOW.timestep * state.side**2, tally.contact_moment, rtol=1e-12
+        own["stress"] * FLOW.timestep * end.side**2, tally.contact_moment, rtol=1e-12
     )
     assert own["temperature"] == pytest.approx(
         float(jnp.sum(observed[1].observed_sums["temperature"])), rel=1e-3
@@ -191,8 +193,13 @@ def test_callback_is_refused_under_a_transformation(flowing) -> None:
 def test_the_fewest_records_of_a_call_give_the_same_sums(flowing, observed, monkeypatch) -> None:
     monkeypatch.setattr(records, "_MOST_BYTES", 1)
     _, own = sample(FLOW, flowing(0.7), STRAIN, observe=lambda seen: observe(seen))
-    same = partial(np.testing.assert_allclose, rtol=1e-14)  # XLA may add up in another order
-    jax.tree.map(same, own.observed_sums, observed[1].observed_sums)
+    same = partial(np.testing.assert_allclose, rtol=1e-9)  # by other lists of near pairs
+    same(own.observed_sums.pop("temperature"), observed[1].observed_sums["temperature"], rtol=1e-3)
+    jax.tree.map(
+        same,
+        own.observed_sums,
+        {name: observed[1].observed_sums[name] for name in own.observed_sums},
+    )
 
 
 @pytest.mark.parametrize(("step_observed", "middle"), [(0.0, 2.5), (1.0, 3.0)])

@@ -9,7 +9,7 @@ from numba import njit
 
 from benchmarks.collection import Entry
 from benchmarks.collection.compare import CAP, Answer, Solve
-from jaxgran.dynamics.numba_engine.allocation import arrays_of
+from jaxgran.dynamics.numba_engine.arrays import arrays_of
 from jaxgran.dynamics.numba_engine.collisions import residual_target, solve_network
 from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
@@ -17,12 +17,9 @@ from jaxgran.dynamics.numba_engine.layout import (
     FIRST,
     IMPULSE,
     INFEASIBLE,
-    INVERSE_MASS,
     NX,
     NY,
     SECOND,
-    WORDS,
-    WORDS_PER_GRAIN,
 )
 
 
@@ -31,14 +28,13 @@ def by_cluster(entry: Entry, tolerance: float) -> Solve:
     cluster.
     """
     problem = entry.problem
-    ends, count = np.ascontiguousarray(problem.ends.T, np.uint32), len(problem.masses)
+    ends = np.ascontiguousarray(problem.ends.T, np.uint32)
     normals, inverse_masses = np.ascontiguousarray(problem.normals.T), 1 / problem.masses
-    block = np.empty(WORDS + WORDS_PER_GRAIN * count)
 
     def solve() -> Answer | None:
-        impulses, memory = np.empty_like(problem.approach), np.array([block.ctypes.data])
+        impulses = np.empty_like(problem.approach)
         iterations, status = _solve(
-            memory, ends, normals, inverse_masses, problem.approach, impulses, float(tolerance), CAP
+            ends, normals, inverse_masses, problem.approach, impulses, float(tolerance), CAP
         )
         return None if status == INFEASIBLE else Answer(impulses, iterations)
 
@@ -46,13 +42,13 @@ def by_cluster(entry: Entry, tolerance: float) -> Solve:
 
 
 @njit(error_model="numpy")
-def _solve(memory, ends, normals, inverse_masses, approach, impulses, tolerance, max_steps):
+def _solve(ends, normals, inverse_masses, approach, impulses, tolerance, max_steps):
     """As ``collide`` of the engine, for a given network."""
     count, contacts = inverse_masses.size, approach.size
-    arrays, _ = arrays_of(memory, count)
+    arrays = arrays_of(count)
     grains, network, clusters = arrays.grains, arrays.network, arrays.clusters
     for g in range(count):
-        grains.constants[g, INVERSE_MASS] = inverse_masses[g]
+        grains.constants[g].inverse_mass = inverse_masses[g]
     scale, touched_count = 0.0, 0
     for c in range(contacts):
         for end in (FIRST, SECOND):

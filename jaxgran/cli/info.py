@@ -84,12 +84,12 @@ def _devices() -> dict[str, str]:
 def _caches() -> dict[str, Path | None]:
     import matplotlib
 
-    from jaxgran.dynamics.numba_engine.ffi import object_file
+    from jaxgran.dynamics.numba_engine.ffi import engine_folder
 
     return {
         "cache folder": users_folder(),
         "compiled programs": programs_folder(),
-        "numba engine": object_file().parent,
+        "numba engine": engine_folder().parent,
         "figures": Path(matplotlib.get_cachedir()),
     }
 

@@ -2,15 +2,13 @@
 stops.
 """
 
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TypeVar
 
 import jax
 
-_FFI = "jaxgran.dynamics.numba_engine.ffi"
+from jaxgran.dynamics.numba_engine.ffi import engines_stopped
+
 PATIENCE = 0.5  # seconds; longest wait for the end of what was interrupted
 T = TypeVar("T")
 
@@ -28,18 +26,6 @@ def waited(results: T) -> T:
         with engines_stopped():
             _wait(results)
         raise
-
-
-@contextmanager
-def engines_stopped() -> Iterator[None]:
-    """Within this block every running call of the numba engine in this process ends, with the
-    status ``failed``.
-    """
-    if _FFI not in sys.modules:
-        yield
-        return
-    with sys.modules[_FFI].stopped():
-        yield
 
 
 def _wait(results: object) -> None:

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit, njit
+from jaxgran.dynamics.numba_engine.compilation import LAW, njit
 from jaxgran.dynamics.numba_engine.layout import (
     BEGINS,
     ENDS,
@@ -22,13 +22,8 @@ from jaxgran.dynamics.numba_engine.layout import (
     LEAST_SHIFT,
     MANY,
     NEVER,
-    RADIUS,
     SECOND,
     STRIKES,
-    VX,
-    VY,
-    X,
-    Y,
 )
 
 gap_coefficients, gap_discriminant = LAW["gap_coefficients"], LAW["gap_discriminant"]
@@ -40,7 +35,7 @@ _ENTRIES_A_CONTACT = 900  # passed over in the time in which one contact renews 
 _ROW, _ROW_SHIFT = 16, 4  # bounds that are compared together
 
 
-@inline_njit
+@njit
 def pair_motion(p, t, flow, grains, pairs):
     """Both grains of a pair, its separation at the time t since the search, and its relative
     velocity.
@@ -48,13 +43,13 @@ def pair_motion(p, t, flow, grains, pairs):
     motion, images = grains.motion, pairs.images
     i, j = pairs.ends[FIRST, p], pairs.ends[SECOND, p]
     up = images[IMAGE_ROW, p] * flow.side
-    ux, uy = motion[i, VX] - motion[j, VX] - flow.shear_rate * up, motion[i, VY] - motion[j, VY]
-    dx = motion[i, X] - motion[j, X] - images[IMAGE_X, p] + ux * t
-    dy = motion[i, Y] - motion[j, Y] - up + uy * t
+    ux, uy = motion[i].vx - motion[j].vx - flow.shear_rate * up, motion[i].vy - motion[j].vy
+    dx = motion[i].x - motion[j].x - images[IMAGE_X, p] + ux * t
+    dy = motion[i].y - motion[j].y - up + uy * t
     return i, j, dx, dy, ux, uy
 
 
-@inline_njit
+@njit
 def predict_contact_steps(count, t, earliest, horizon, shift, flow, grains, pairs):
     """Write when, from the step ``earliest`` on, the listed pairs are contacts if their grains are
     not struck.
@@ -70,7 +65,7 @@ def predict_contact_steps(count, t, earliest, horizon, shift, flow, grains, pair
         for n in range(size):
             i, j, dx, dy, ux, uy = pair_motion(listed[start + n], t, flow, grains, pairs)
             flights[0, n], flights[1, n], flights[2, n], flights[3, n] = dx, dy, ux, uy
-            flights[4, n] = grains.constants[i, RADIUS] + grains.constants[j, RADIUS]
+            flights[4, n] = grains.constants[i].radius + grains.constants[j].radius
         for n in range((size + _TOGETHER - 1) // _TOGETHER * _TOGETHER):
             strikes, begins, ends = _contact_steps(
                 flights[0, n],
@@ -94,7 +89,7 @@ def predict_contact_steps(count, t, earliest, horizon, shift, flow, grains, pair
                 bounds[BEGINS, b] = min(bounds[BEGINS, b], entries[BEGINS, n])
 
 
-@inline_njit
+@njit
 def _contact_steps(dx, dy, ux, uy, reach, t, earliest, horizon, flow):
     """The entries of the calendar of a pair: the step in which it strikes, and the first and last
     step in which it is a contact.
@@ -128,14 +123,14 @@ def _contact_steps(dx, dy, ux, uy, reach, t, earliest, horizon, flow):
     )
 
 
-@inline_njit
+@njit
 def _as_step(number):
     """A number as a step of the calendar: -1 if it is past or NaN, and at most the last step."""
     number = number if number > -1.0 else -1.0
     return number if number < MANY else MANY
 
 
-@inline_njit
+@njit
 def clear_calendar(pair_count, pairs):
     """Pad the calendar to whole ``LANES``; returns the number of its entries."""
     entries = (pair_count + LANES - 1) // LANES * LANES
@@ -145,7 +140,7 @@ def clear_calendar(pair_count, pairs):
     return entries
 
 
-@inline_njit
+@njit
 def choose_blocks(entries, steps, pairs):
     """The size of a block as a power of two, or 0 where it costs less to pass over all entries at
     each event.
@@ -166,7 +161,7 @@ def choose_blocks(entries, steps, pairs):
     return shift
 
 
-@inline_njit
+@njit
 def _pairs_of_block(b, entries, shift):
     """The first pair of a block, unsigned so that loops over pairs vectorise, and the number of its
     pairs.
@@ -175,7 +170,7 @@ def _pairs_of_block(b, entries, shift):
     return np.uint64(first), min(1 << shift, entries - first)
 
 
-@inline_njit
+@njit
 def bound_blocks(entries, shift, pairs):
     """Write the least strike and the least begin of each block; the bounds are padded to whole
     rows.
@@ -191,13 +186,13 @@ def bound_blocks(entries, shift, pairs):
         bounds[STRIKES, b], bounds[BEGINS, b] = strike, begin
 
 
-@inline_njit
+@njit
 def _last_row(entries, shift):
     """The last row of ``_ROW`` bounds."""
     return (entries - 1) >> (shift + _ROW_SHIFT)
 
 
-@inline_njit
+@njit
 def next_contact_step(entries, shift, pairs):
     """The next step in which some contact approaches."""
     if shift > 0:
@@ -209,7 +204,7 @@ def next_contact_step(entries, shift, pairs):
     return strike
 
 
-@inline_njit
+@njit
 def _next_by_blocks(entries, shift, pairs):
     """The same by the bounds of blocks: the least bound that is the strike of a pair; lower ones
     are renewed.
@@ -238,7 +233,7 @@ def _next_by_blocks(entries, shift, pairs):
                             return least
 
 
-@inline_njit
+@njit
 def contacts_of_step(k, entries, shift, pairs, near_pair):
     """Write the pairs that are contacts in a step; those beyond the room are counted, not written.
 
@@ -259,7 +254,7 @@ def contacts_of_step(k, entries, shift, pairs, near_pair):
     return contacts
 
 
-@inline_njit
+@njit
 def _contacts_by_blocks(k, entries, shift, pairs, near_pair):
     """The same by the bounds of blocks, which become those of the steps after ``k`` in the blocks
     that have begun.
@@ -294,7 +289,7 @@ def _after(now, first, size, calendar):
     return inside, strike, begin
 
 
-@inline_njit
+@njit
 def _contacts_among(first, size, now, contacts, pairs, near_pair):
     """Write the contacts among ``size`` pairs behind those found before; returns how many there are
     now.

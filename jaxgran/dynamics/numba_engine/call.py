@@ -32,57 +32,54 @@ def advance_by_numba(
     if jnp.ndim(steps) == 0:
         end, tally = advance_by_numba(flow, solver, state, jnp.asarray(steps)[None])
         return end, jax.tree.map(lambda x: x[0], tally)
-    call = call_numba(flow, solver, state, steps)
-    energies = jnp.concatenate([kinetic_energy(state.grains, state.velocities)[None], call.kinetic])
+    call = call_numba(flow, solver, state, steps, first_row(flow, state))
+    rows = call.blocks
+    energy = kinetic_energy(state.grains, state.velocities)
+    energies = jnp.concatenate([energy[None], rows[:, layout.KINETIC]])
     tallies = jax.vmap(lambda sums, **ends: sums.tally(**ends))(
-        call.sums, energy_change=jnp.diff(energies), momentum_drift=call.drift
+        sums_of_row(rows), energy_change=jnp.diff(energies), momentum_drift=rows[:, layout.DRIFT]
     )
-    end, last = _end_of(state, call)  # with the energy change of all blocks
+    moved = replace(state, positions=call.positions, velocities=call.velocities)
+    end, last = ended_by_numba(state, moved, rows[-1])  # with the energy change of all blocks
     last = replace(last, energy_change=last.energy_change - (energies[-2] - energies[0]))
     return end, jax.tree.map(lambda all_blocks, x: all_blocks.at[-1].set(x), tallies, last)
 
 
-def _end_of(state: State, call: "NumbaCall") -> tuple[State, Tally]:
-    """The state at the end of a call from a state, and the tally of its last block, with the whole
-    energy change.
-    """
-    sums = jax.tree.map(lambda x: x[-1], call.sums)
-    return ended(state, call.end.positions, call.end.tilt, call.end.velocities, sums)
+def ended_by_numba(state: State, moved: State, row: Array) -> tuple[State, Tally]:
+    """The state at the end of an advance from a state, and the tally of a row of results."""
+    return ended(state, moved.positions, row[layout.TILT], moved.velocities, sums_of_row(row))
+
+
+def first_row(flow: ShearFlow, state: State) -> Array:
+    """The row with which a call begins that does not go on with another."""
+    dtype = state.positions.dtype
+    status = status_at_start(flow, state).astype(dtype)
+    row = jnp.zeros(layout.RESULTS, dtype)
+    return row.at[layout.STATUS].set(status).at[layout.TILT].set(state.tilt)
+
+
+def sums_of_row(row: Array) -> RunningSums:
+    """The running sums in a row of results, or in those of several blocks."""
+    return RunningSums(row[..., :NUMBERS], row[..., layout.STATUS].astype(jnp.int32))
 
 
 class NumbaCall(NamedTuple):
     """What a call of the numba engine returns.
 
-    =========  ===============  ====================================================================
-    field      shape            meaning
-    =========  ===============  ====================================================================
-    end        State            the state at the end, unless the call is suspended
-    sums       RunningSums      (blocks,) the running sums, with those of the calls that it resumes
-    kinetic    (blocks,)        kinetic energy at the end of each block but the last one
-    drift      (blocks,)        relative momentum then
-    suspended  ()               where the call is suspended; 0 if it is finished
-    recorded   ()               number of records
-    records    (room, numbers)  see ``numba_engine.records``
-    memory     (words,)         memory of the engine, from which another call resumes; (0,) without
-                                records
-    =========  ===============  ====================================================================
+    =====================  =================  ======================================================
+    field                  shape              meaning
+    =====================  =================  ======================================================
+    positions, velocities  (grains, 2)        of the state at the end; of an unfinished call in the
+                                              laboratory, as the next one takes them
+    blocks                 (blocks, RESULTS)  sums and results of each block, see ``layout``
+    records                (room, numbers)    see ``records``
+    =====================  =================  ======================================================
     """
 
-    end: State
-    sums: RunningSums
-    kinetic: Array
-    drift: Array
-    suspended: Array
-    recorded: Array
+    positions: Array
+    velocities: Array
+    blocks: Array
     records: Array
-    memory: Array
-
-
-def numba_memory(flow: ShearFlow) -> jax.ShapeDtypeStruct:
-    """The memory of the numba engine for one replica."""
-    return jax.ShapeDtypeStruct(
-        (1 + layout.WORDS + layout.WORDS_PER_GRAIN * flow.grains,), jnp.float64
-    )
 
 
 def call_numba(
@@ -90,18 +87,18 @@ def call_numba(
     solver: ProjectedMethod,
     state: State,
     steps: Array,
+    begin: Array,
     room: int = 0,
-    suspended: Array | int = 0,
-    memory: Array | None = None,
 ) -> NumbaCall:
     """Run the numba engine once.
 
     Args:
-      flow, solver, state: as in ``advance``.
+      flow, solver, state: as in ``advance``; of the state the positions and velocities that an
+        unfinished call has left, to go on with it.
       steps: (blocks,) numbers of time steps.
-      room: number of records, static, for one block. The call is suspended where there is no room
-        for more; 0 records nothing.
-      suspended, memory: those of an earlier call with the same arguments, to resume it; 0 to begin.
+      begin: ``first_row``, or the last row of the call to go on with.
+      room: number of records, static, for one block; 0 records nothing. With records the call ends
+        unfinished where its list of near pairs ends, or the room.
     """
     from jaxgran.dynamics.numba_engine.ffi import TARGET
 
@@ -109,28 +106,20 @@ def call_numba(
     dtype, grains = state.positions.dtype, state.grains
     inputs = layout.Inputs(
         side=state.side,
-        tilt=state.tilt,
         restitution=flow.restitution,
         timestep=flow.timestep,
         shear_rate=flow.shear_rate,
         tolerance=solver.tolerance,
         activation=flow.activation,
         max_steps=solver.max_steps,
-        status=status_at_start(flow, state),
-        resume_at=suspended,
     )
     shapes = [
         state.positions.shape,
         state.positions.shape,
         (*steps.shape, layout.RESULTS),
-        numba_memory(flow).shape if room > 0 else (0,),  # without records no call is resumed
         (room, layout.record_numbers(flow.grains)),
     ]
     results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
-    aliases = None if memory is None else {layout.MEMORY_GIVEN: layout.MEMORY}
-    call = jax.ffi.ffi_call(
-        TARGET, results, vmap_method="broadcast_all", input_output_aliases=aliases
-    )
     operands = (
         state.positions,
         state.velocities,
@@ -138,15 +127,10 @@ def call_numba(
         grains.masses,
         jnp.stack([jnp.asarray(x).astype(dtype) for x in inputs]),
         steps.astype(dtype),
-        *(() if memory is None else (memory,)),
+        begin,
     )
     kinds = {x.dtype.name for x in operands}
     if kinds != {"float64"}:  # the engine reads doubles whatever it is given
         raise InputError(f"the engine numba must be given float64 only, not {sorted(kinds)}.")
-    positions, velocities, blocks, memory, records = call(*operands)
-    last = blocks[-1]
-    end = State(grains, positions, velocities, state.side, last[layout.TILT])
-    sums = RunningSums(blocks[:, :NUMBERS], blocks[:, layout.STATUS].astype(jnp.int32))
-    recorded = last[layout.RECORDED].astype(jnp.int32)
-    kinetic, drift = blocks[:, layout.KINETIC], blocks[:, layout.DRIFT]
-    return NumbaCall(end, sums, kinetic, drift, last[layout.SUSPENDED], recorded, records, memory)
+    call = jax.ffi.ffi_call(TARGET, results, vmap_method="broadcast_all")
+    return NumbaCall(*call(*operands))

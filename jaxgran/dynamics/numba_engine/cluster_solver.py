@@ -14,31 +14,18 @@ import math
 import numpy as np
 
 from jaxgran.contact.law import JAMMED_RESPONSE, LONGEST_STRIDE, PROGRESS, WINDOW
-from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit, njit
+from jaxgran.dynamics.numba_engine.compilation import LAW, njit
 from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
-    BEST,
-    BOUND,
     FIRST,
     IMPULSE,
     INFEASIBLE,
-    INVERSE_MASS,
-    INVERSE_MU,
-    INVERSE_MU_MI,
-    INVERSE_MU_MJ,
     ITERATION_LIMIT,
-    MU_NX,
-    MU_NY,
-    MU_U,
     NONFINITE,
     NX,
     NY,
     OK,
-    RESPONSE,
-    RESPONSE_CHANGE,
     SECOND,
-    STEP,
-    J,
 )
 
 largest_eigenvalue = LAW["largest_eigenvalue"]
@@ -52,7 +39,7 @@ _PARTS = 8
 _RELAXATION = np.minimum(1 + 0.075 * np.log2(np.maximum(np.arange(641), 1)), 1.7)
 
 
-@inline_njit
+@njit
 def solve_cluster(m, target, max_steps, grains, network, clusters):
     """Write the impulses J₀ of cluster m at restitution zero.
 
@@ -73,16 +60,16 @@ def solve_cluster(m, target, max_steps, grains, network, clusters):
             jammed = _is_jammed(size, clusters)
             iterations += more
             for c in range(size):
-                rows[c, J] = iterate[c, BEST]
+                rows[c].impulse = iterate[c].best
         status = OK if squared_residual <= target else INFEASIBLE if jammed else ITERATION_LIMIT
         if not squared_residual < math.inf:
             status = NONFINITE
     for c in range(size):
-        impulses[IMPULSE, places[c]] = rows[c, J]
+        impulses[IMPULSE, places[c]] = rows[c].impulse
     return iterations, squared_residual, status
 
 
-@inline_njit
+@njit
 def _take_contacts(start, size, grains, network, clusters):
     """Copy the contacts of a cluster for the solver, one from each part of the cluster in turn."""
     source, places, ends = clusters.source, clusters.places, clusters.ends
@@ -94,15 +81,15 @@ def _take_contacts(start, size, grains, network, clusters):
     while c < size:
         place = source[n]
         i, j = network.ends[FIRST, place], network.ends[SECOND, place]
-        mi, mj = constants[i, INVERSE_MASS], constants[j, INVERSE_MASS]
+        mi, mj = constants[i].inverse_mass, constants[j].inverse_mass
         mobility = mi + mj
         reduced_mass = 1 / mobility
         places[c], ends[c, FIRST], ends[c, SECOND] = place, i, j
-        rows[c, MU_NX] = contacts[NX, place] * reduced_mass
-        rows[c, MU_NY] = contacts[NY, place] * reduced_mass
-        rows[c, MU_U], rows[c, INVERSE_MU] = contacts[APPROACH, place] * reduced_mass, mobility
-        rows[c, INVERSE_MU_MI], rows[c, INVERSE_MU_MJ] = mobility * mi, mobility * mj
-        rows[c, J] = 0.0
+        rows[c].mu_nx = contacts[NX, place] * reduced_mass
+        rows[c].mu_ny = contacts[NY, place] * reduced_mass
+        rows[c].mu_u, rows[c].inverse_mu = contacts[APPROACH, place] * reduced_mass, mobility
+        rows[c].inverse_mu_mi, rows[c].inverse_mu_mj = mobility * mi, mobility * mj
+        rows[c].impulse = 0.0
         dv[i, 0] = dv[i, 1] = dv[j, 0] = dv[j, 1] = 0.0
         c += one
         n += length
@@ -111,11 +98,11 @@ def _take_contacts(start, size, grains, network, clusters):
             n = np.uint64(start) + begin
 
 
-@inline_njit
+@njit
 def _mu_response(c, rows, ends, dv):
     """μ (W J) of a contact, from the changes of the grains' velocities."""
     i, j = ends[c, FIRST], ends[c, SECOND]
-    return rows[c, MU_NX] * (dv[i, 0] - dv[j, 0]) + rows[c, MU_NY] * (dv[i, 1] - dv[j, 1])
+    return rows[c].mu_nx * (dv[i, 0] - dv[j, 0]) + rows[c].mu_ny * (dv[i, 1] - dv[j, 1])
 
 
 @njit
@@ -126,12 +113,12 @@ def _is_jammed(size, clusters):
     rows, ends, dv = clusters.rows, clusters.ends, clusters.dv
     j_w_j = minus_j_u = 0.0
     for c in range(size):
-        j_w_j += rows[c, J] * _mu_response(c, rows, ends, dv) * rows[c, INVERSE_MU]
-        minus_j_u -= rows[c, J] * rows[c, MU_U] * rows[c, INVERSE_MU]
+        j_w_j += rows[c].impulse * _mu_response(c, rows, ends, dv) * rows[c].inverse_mu
+        minus_j_u -= rows[c].impulse * rows[c].mu_u * rows[c].inverse_mu
     return j_w_j < JAMMED_RESPONSE * minus_j_u
 
 
-@inline_njit
+@njit
 def _sweep(size, target, max_sweeps, clusters):
     """Projected Gauss–Seidel sweeps with over-relaxation; returns their number and the squared
     residual.
@@ -148,26 +135,26 @@ def _sweep(size, target, max_sweeps, clusters):
         for c in range(size):  # without a branch, which would be mispredicted
             i, j = ends[c, FIRST], ends[c, SECOND]
             ix, iy, jx, jy = dv[i, 0], dv[i, 1], dv[j, 0], dv[j, 1]
-            mu_nx, mu_ny, impulse = rows[c, MU_NX], rows[c, MU_NY], rows[c, J]
+            mu_nx, mu_ny, impulse = rows[c].mu_nx, rows[c].mu_ny, rows[c].impulse
             change = max(
-                relaxation * (mu_nx * (jx - ix) + mu_ny * (jy - iy) - rows[c, MU_U]), -impulse
+                relaxation * (mu_nx * (jx - ix) + mu_ny * (jy - iy) - rows[c].mu_u), -impulse
             )
-            rows[c, J] = impulse + change
+            rows[c].impulse = impulse + change
             per_mass_i, per_mass_j = (
-                change * rows[c, INVERSE_MU_MI],
-                change * rows[c, INVERSE_MU_MJ],
+                change * rows[c].inverse_mu_mi,
+                change * rows[c].inverse_mu_mj,
             )
             dv[i, 0], dv[i, 1] = ix + per_mass_i * mu_nx, iy + per_mass_i * mu_ny
             dv[j, 0], dv[j, 1] = jx - per_mass_j * mu_nx, jy - per_mass_j * mu_ny
-            error = change * rows[c, INVERSE_MU]
+            error = change * rows[c].inverse_mu
             estimate += error * error
         sweeps += 1
         keep_going = sweeps < max_sweeps and estimate < math.inf
         if estimate <= target * relaxation * relaxation or not keep_going:
             squared_residual = 0.0
             for c in range(size):
-                mu_velocity = _mu_response(c, rows, ends, dv) + rows[c, MU_U]
-                error = min(rows[c, J], mu_velocity) * rows[c, INVERSE_MU]
+                mu_velocity = _mu_response(c, rows, ends, dv) + rows[c].mu_u
+                error = min(rows[c].impulse, mu_velocity) * rows[c].inverse_mu
                 squared_residual += error * error
             keep_going &= not squared_residual <= target
     return sweeps, squared_residual
@@ -192,36 +179,36 @@ def _descend(size, target, max_iterations, clusters):
         momentum, descent = k / (k + 3.0), 0.0
         for c in range(size):
             i, j = ends[c, FIRST], ends[c, SECOND]
-            impulse, bound = rows[c, J], iterate[c, BOUND]
-            start = impulse + momentum * iterate[c, STEP]
+            impulse, bound = rows[c].impulse, iterate[c].bound
+            start = impulse + momentum * iterate[c].step
             velocity = (
-                iterate[c, RESPONSE]
-                + momentum * iterate[c, RESPONSE_CHANGE]
-                + rows[c, MU_U] * rows[c, INVERSE_MU]
+                iterate[c].response
+                + momentum * iterate[c].response_change
+                + rows[c].mu_u * rows[c].inverse_mu
             )
             new_impulse = max(0.0, start - stride * velocity / bound)
             descent += (start - new_impulse) * (new_impulse - impulse) * bound
-            iterate[c, STEP] = new_impulse - impulse
-            rows[c, J] = new_impulse
+            iterate[c].step = new_impulse - impulse
+            rows[c].impulse = new_impulse
             dv[i, 0] = dv[i, 1] = dv[j, 0] = dv[j, 1] = 0.0
         for c in range(size):
-            i, j, impulse = ends[c, FIRST], ends[c, SECOND], rows[c, J]
+            i, j, impulse = ends[c, FIRST], ends[c, SECOND], rows[c].impulse
             per_mass_i, per_mass_j = (
-                impulse * rows[c, INVERSE_MU_MI],
-                impulse * rows[c, INVERSE_MU_MJ],
+                impulse * rows[c].inverse_mu_mi,
+                impulse * rows[c].inverse_mu_mj,
             )
-            dv[i, 0] += per_mass_i * rows[c, MU_NX]
-            dv[i, 1] += per_mass_i * rows[c, MU_NY]
-            dv[j, 0] -= per_mass_j * rows[c, MU_NX]
-            dv[j, 1] -= per_mass_j * rows[c, MU_NY]
+            dv[i, 0] += per_mass_i * rows[c].mu_nx
+            dv[i, 1] += per_mass_i * rows[c].mu_ny
+            dv[j, 0] -= per_mass_j * rows[c].mu_nx
+            dv[j, 1] -= per_mass_j * rows[c].mu_ny
         # with the last step s: sᵀWs, sᵀDs and (Ws)ᵀD⁻¹(Ws)
         squared_residual = curvature = squared_step = squared_response = 0.0
         for c in range(size):
-            bound, mu_response = iterate[c, BOUND], _mu_response(c, rows, ends, dv)
-            response = mu_response * rows[c, INVERSE_MU]
-            error = min(rows[c, J], mu_response + rows[c, MU_U]) * rows[c, INVERSE_MU]
-            step, change = iterate[c, STEP], response - iterate[c, RESPONSE]
-            iterate[c, RESPONSE_CHANGE], iterate[c, RESPONSE] = change, response
+            bound, mu_response = iterate[c].bound, _mu_response(c, rows, ends, dv)
+            response = mu_response * rows[c].inverse_mu
+            error = min(rows[c].impulse, mu_response + rows[c].mu_u) * rows[c].inverse_mu
+            step, change = iterate[c].step, response - iterate[c].response
+            iterate[c].response_change, iterate[c].response = change, response
             squared_residual += error * error
             curvature += step * change
             squared_step += step * step * bound
@@ -229,7 +216,7 @@ def _descend(size, target, max_iterations, clusters):
         if squared_residual < best:
             best = squared_residual
             for c in range(size):
-                iterate[c, BEST] = rows[c, J]
+                iterate[c].best = rows[c].impulse
         window_ends = iterations % WINDOW == WINDOW - 1
         if guarded or (window_ends and not math.sqrt(best) < PROGRESS * last_residual):
             stride, k = 1.0, k + 1 if guarded and not descent > 0.0 else 0
@@ -246,7 +233,7 @@ def _descend(size, target, max_iterations, clusters):
     return iterations, best
 
 
-@inline_njit
+@njit
 def _start_descent(size, clusters):
     """Write the diagonal D and the response W J of the contacts of a cluster."""
     rows, iterate, ends = clusters.rows, clusters.iterate, clusters.ends
@@ -255,20 +242,20 @@ def _start_descent(size, clusters):
         for end in range(2):
             matrices[ends[c, end], 0] = matrices[ends[c, end], 1] = matrices[ends[c, end], 2] = 0.0
     for c in range(size):
-        nx, ny = rows[c, MU_NX] * rows[c, INVERSE_MU], rows[c, MU_NY] * rows[c, INVERSE_MU]
+        nx, ny = rows[c].mu_nx * rows[c].inverse_mu, rows[c].mu_ny * rows[c].inverse_mu
         for end in range(2):
             g = ends[c, end]
             matrices[g, 0] += nx * nx
             matrices[g, 1] += nx * ny
             matrices[g, 2] += ny * ny
     for c in range(size):
-        nx, ny = rows[c, MU_NX] * rows[c, INVERSE_MU], rows[c, MU_NY] * rows[c, INVERSE_MU]
+        nx, ny = rows[c].mu_nx * rows[c].inverse_mu, rows[c].mu_ny * rows[c].inverse_mu
         i, j = ends[c, FIRST], ends[c, SECOND]
-        inverse_mass_i = rows[c, INVERSE_MU_MI] / rows[c, INVERSE_MU]
-        inverse_mass_j = rows[c, INVERSE_MU_MJ] / rows[c, INVERSE_MU]
+        inverse_mass_i = rows[c].inverse_mu_mi / rows[c].inverse_mu
+        inverse_mass_j = rows[c].inverse_mu_mj / rows[c].inverse_mu
         width_i = largest_eigenvalue(matrices[i, 0], matrices[i, 1], matrices[i, 2])
         width_j = largest_eigenvalue(matrices[j, 0], matrices[j, 1], matrices[j, 2])
         bound = width_i * inverse_mass_i + width_j * inverse_mass_j
-        iterate[c, BOUND], iterate[c, BEST] = bound, rows[c, J]
-        iterate[c, STEP] = iterate[c, RESPONSE_CHANGE] = 0.0
-        iterate[c, RESPONSE] = nx * (dv[i, 0] - dv[j, 0]) + ny * (dv[i, 1] - dv[j, 1])
+        iterate[c].bound, iterate[c].best = bound, rows[c].impulse
+        iterate[c].step = iterate[c].response_change = 0.0
+        iterate[c].response = nx * (dv[i, 0] - dv[j, 0]) + ny * (dv[i, 1] - dv[j, 1])

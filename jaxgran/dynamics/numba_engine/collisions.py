@@ -5,18 +5,13 @@ import math
 import numpy as np
 
 from jaxgran.dynamics.numba_engine.cluster_solver import solve_cluster
-from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit
+from jaxgran.dynamics.numba_engine.compilation import LAW, njit
 from jaxgran.dynamics.numba_engine.layout import (
     EPSILON,
     FIRST,
-    INVERSE_MASS,
     OK,
     SECOND,
     STRIKES,
-    VX,
-    VY,
-    X,
-    Y,
 )
 from jaxgran.dynamics.numba_engine.network import (
     find_clusters,
@@ -29,7 +24,7 @@ from jaxgran.dynamics.numba_engine.sums import add_contacts, add_solve
 residual_target, relative_residual = LAW["residual_target"], LAW["relative_residual"]
 
 
-@inline_njit
+@njit
 def collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, sums):
     """Solve the contacts of a step and add them to the sums; returns the number of their grains,
     and the status.
@@ -47,7 +42,7 @@ def collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, sums
     return touched_count, status
 
 
-@inline_njit
+@njit
 def solve_network(contacts, touched_count, target, max_steps, grains, network, clusters):
     """Write the impulses J₀ of a network at restitution zero, to a residual of ``target``.
 
@@ -70,7 +65,7 @@ def solve_network(contacts, touched_count, target, max_steps, grains, network, c
     return iterations, squared_residual, status
 
 
-@inline_njit
+@njit
 def strike(touched_count, t, shear_rate, grains, network, clusters, kinetic, max_speed):
     """Change the velocities of the struck grains; returns Σ m c ⊗ c and the largest speed after it,
     and whether all is finite.
@@ -85,23 +80,23 @@ def strike(touched_count, t, shear_rate, grains, network, clusters, kinetic, max
         g = touched[n]
         network.degree[g], clusters.reached[g] = 0, 0
         px, py = impulses[g, 0], impulses[g, 1]
-        dvx, dvy = px * constants[g, INVERSE_MASS], py * constants[g, INVERSE_MASS]
+        dvx, dvy = px * constants[g].inverse_mass, py * constants[g].inverse_mass
         if dvx != 0.0 or dvy != 0.0:
-            cx, cy = motion[g, VX] - shear_rate * (motion[g, Y] + motion[g, VY] * t), motion[g, VY]
+            cx, cy = motion[g].vx - shear_rate * (motion[g].y + motion[g].vy * t), motion[g].vy
             xx += px * (2 * cx + dvx)
             xy += px * cy + py * cx + px * dvy
             yy += py * (2 * cy + dvy)
             speed = math.sqrt((cx + dvx) * (cx + dvx) + (cy + dvy) * (cy + dvy))
             finite &= speed < math.inf
             max_speed = max(max_speed, speed)
-            motion[g, VX] += dvx
-            motion[g, VY] += dvy
-            motion[g, X] -= dvx * t
-            motion[g, Y] -= dvy * t
+            motion[g].vx += dvx
+            motion[g].vy += dvy
+            motion[g].x -= dvx * t
+            motion[g].y -= dvy * t
     return (xx, xy, yy), max_speed, finite
 
 
-@inline_njit
+@njit
 def list_struck_pairs(k, touched_count, contacts, overfull, pairs, network):
     """List the pairs of the struck grains, each once, for a new prediction; clears the impulses.
 

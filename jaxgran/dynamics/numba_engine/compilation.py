@@ -1,5 +1,5 @@
-"""Compilation by numba: without its runtime, and with the law of a contact and the images of the
-cell from their only source.
+"""Compilation by numba, with the law of a contact and the images of the cell from their only
+source.
 """
 
 import inspect
@@ -14,31 +14,30 @@ import numpy as np
 from jaxgran.contact import law
 from jaxgran.model import cell
 
-OPTIONS: dict[str, Any] = {
-    "error_model": "numpy",
-    "fastmath": {"contract"},
-    # private, but no public option leaves out the calls into numba's runtime, which is not loaded
-    "_nrt": False,
+OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}}
+# Into one function, since structures of arrays are passed by value, some hundred words a call; and
+# since a process that compiles would call other copies of these functions than one that loads the
+# cached code, which differ by rounding.
+_INLINED: dict[str, Any] = {
+    "forceinline": True,
     "no_cpython_wrapper": True,  # nothing here is called from Python
     "no_cfunc_wrapper": True,
+    "_nrt": False,  # private; references to arrays are not counted, which makes the engine faster
 }
-# Structures of arrays are passed by value, some hundred words a call, so functions of every step
-# are inlined.
-inline_njit: Callable[[Callable], Any] = numba.njit(forceinline=True, **OPTIONS)
-njit: Callable[[Callable], Any] = numba.njit(**OPTIONS)  # functions that are seldom called
+njit: Callable[[Callable], Any] = numba.njit(**OPTIONS, **_INLINED)
 
 
-@inline_njit
+@njit
 def _where(condition, yes, no):
     return yes if condition else no
 
 
-@inline_njit
+@njit
 def _maximum(a, b):
     return a if a > b else b
 
 
-@inline_njit
+@njit
 def whole_part(number, most):
     """The whole part of a number, from 0 to ``most``, and 0 of NaN: an index must follow from a
     number by this function, since the whole part of NaN or of a huge number may be anything.
@@ -66,7 +65,7 @@ def _compiled(module: ModuleType) -> dict[str, Any]:
         if f.__module__ == module.__name__
     }
     for name, function in functions.items():
-        names[name] = inline_njit(FunctionType(function.__code__, names, name))
+        names[name] = njit(FunctionType(function.__code__, names, name))
     return {name: names[name] for name in functions}
 
 

@@ -17,8 +17,8 @@ same tolerance and the same sums. It differs in what it visits:
 - *Move.* When a list expires, the grains are moved to their present positions.
 - *Begin a block.* At the end of a block of steps the next row of sums begins, and list and calendar
   stay.
-- *Suspend.* When the records are full, the loop stops. The next call continues in the same memory,
-  so the trajectory and its sums are those of one call, to the bit.
+- *End early.* Where steps are recorded, the loop ends with its first list, or when the records are
+  full, and the next call goes on from there.
 """
 
 import math
@@ -34,26 +34,23 @@ from jaxgran.dynamics.numba_engine.calendar import (
 from jaxgran.dynamics.numba_engine.collisions import collide, list_struck_pairs, strike
 from jaxgran.dynamics.numba_engine.compilation import CELL, njit, whole_part
 from jaxgran.dynamics.numba_engine.layout import (
-    BETWEEN_LISTS,
     CAPACITY,
     DRIFT,
     EPSILON,
     FAILED,
-    INVERSE_MASS,
     KINETIC,
     MANY,
     NONFINITE,
     OK,
+    READ,
     RECORDED,
     RESULTS,
+    SOLVED,
     STATUS,
-    SUSPENDED,
+    STOP,
     TILT,
-    VX,
-    VY,
-    WITHIN_LIST,
+    UNFINISHED,
     Flow,
-    Y,
 )
 from jaxgran.dynamics.numba_engine.motion import (
     bring_into_cell,
@@ -61,13 +58,13 @@ from jaxgran.dynamics.numba_engine.motion import (
     move_grains,
     put_in_order,
     read_state,
+    write_motion,
     write_state,
 )
 from jaxgran.dynamics.numba_engine.near_pairs import LIFE, closing_speed_bound, search
 from jaxgran.dynamics.numba_engine.records import record_contacts, record_flight
 from jaxgran.dynamics.numba_engine.sums import COLLISIONS, add_flight
 from jaxgran.dynamics.numba_engine.velocity_scales import read_velocity_scales
-from jaxgran.dynamics.tally import NUMBERS
 from jaxgran.dynamics.velocity_scales import READ_AFTER
 
 image_in_cell, remap_tilt = CELL["image_in_cell"], CELL["remap_tilt"]
@@ -85,32 +82,34 @@ def advance_loop(
     masses,
     inputs,
     steps,
+    begin,
     new_positions,
     new_velocities,
     results,
     records,
     arrays,
-    stop,
+    shared,
 ):
     """Advance one replica by one block of steps after another.
 
     Args:
-      positions, velocities: (grains, 2) as in a State; ``new_positions`` and ``new_velocities``
-        receive those after.
+      positions, velocities: (grains, 2) as in a State, or as an unfinished call has left them.
       radii, masses: (grains,).
       inputs: the numbers ``layout.Inputs``.
       steps: (blocks,) numbers of time steps.
-      results: (blocks, RESULTS) receives, for each block, the running sums and the status; at the
-        end of all but the last one also a reading of the velocity scales, the kinetic energy and
-        the relative momentum; in the last one the tilt, where the loop is suspended (0 if it is
-        finished), and the number of records.
-      records: (room, numbers) receives ``records`` of the steps of one block; when they are full,
-        the loop is suspended before it writes the new state. Without room it records nothing.
-      arrays: memory of the loop, see ``allocation``; of the earlier call where one was suspended.
-      stop: (1,), a word that another thread may set; unless it is zero, the loop ends with the
+      begin: (RESULTS,) the sums and the other numbers before the first step, see ``layout``.
+      new_positions, new_velocities: (grains, 2) receive those of the state after the last step; of
+        an unfinished call the positions of unwrapped grains, and velocities in the laboratory.
+      results: (blocks, RESULTS) receives the sums of each block, see ``layout``; those of the first
+        one go on from ``begin``.
+      records: (room, numbers) receives ``records`` of the steps of one block; with the first list
+        of near pairs, or when they are full, the loop ends unfinished. Without room it records
+        nothing.
+      arrays: memory of the loop.
+      shared: words shared with Python; unless that of ``STOP`` is zero, the loop ends with the
         status ``failed``.
     """
-    side, tilt, shear_rate, dt = inputs.side, inputs.tilt, inputs.shear_rate, inputs.timestep
+    side, shear_rate, dt = inputs.side, inputs.shear_rate, inputs.timestep
     flow = Flow(
         side,
         shear_rate,
@@ -125,27 +124,19 @@ def advance_loop(
     for b in range(blocks):
         all_steps += int(steps[b])
         for n in range(RESULTS):
-            results[b, n] = 0.0
+            results[b, n] = begin[n] if b == 0 else 0.0
     block, block_end, sums = 0, int(steps[0]), results[0]
+    tilt, goes_on = begin[TILT], begin[UNFINISHED] > 0.0
+    # ``solved``: whether the contacts of the present step have been dealt with
+    steps_before_list, solved = 0, whole_part(begin[SOLVED], 1)
+    collisions_read = begin[READ]  # collisions until the last reading of the velocity scales
 
-    grains, pairs, network, clusters, order, step_sums, saved_sums, saved_numbers = arrays
-    saved = saved_numbers[0]
-    resume_at = int(inputs.resume_at)
-    if resume_at > 0:
-        for n in range(NUMBERS):
-            sums[n] = saved_sums[n]
-        tilt, largest_diameter = saved.tilt, saved.largest_diameter
-        steps_before_list, solved, status = saved.steps_before_list, saved.solved, saved.status
-        collisions_read = saved.collisions_read
-    else:
-        put_in_order(positions, side, tilt, order)
-        largest_diameter, finite = read_state(
-            positions, velocities, radii, masses, order.in_state, shear_rate, grains
-        )
-        # ``solved``: whether the contacts of the present step have been dealt with
-        steps_before_list, solved = 0, 0
-        status = whole_part(inputs.status, FAILED) if finite else NONFINITE
-        collisions_read = 0.0  # collisions until the last reading of the velocity scales
+    grains, pairs, network, clusters, step_sums = arrays
+    put_in_order(positions, side, tilt, grains, pairs)
+    largest_diameter, finite = read_state(
+        positions, velocities, radii, masses, 0.0 if goes_on else shear_rate, grains
+    )
+    status = whole_part(begin[STATUS], FAILED) if finite else NONFINITE
     widest_skin = side / 2 - largest_diameter  # nearest images are unique
     if widest_skin < 0.0:
         status, widest_skin = max(status, CAPACITY), 0.0
@@ -153,62 +144,36 @@ def advance_loop(
     usual_skin = min(max(expected_skin, _NARROWEST_SKIN), widest_skin)
 
     life = LIFE / shear_rate if shear_rate > 0.0 else math.inf
-    room, recorded, suspended = records.shape[0], 0, 0
+    room, recorded = records.shape[0], 0
     while steps_before_list < all_steps and status < NONFINITE:
-        if 0 < room < recorded + 2:  # for a list and for contacts
-            suspended = BETWEEN_LISTS
+        k, new_list = 0, True  # steps since the search
+        max_speed = bring_into_cell(grains, side, tilt, shear_rate)
+        kinetic = kinetic_sums(grains, shear_rate)
+        # what one step may need
+        least_skin = 1.2 * (2 * max_speed * (1 + LIFE) + shear_rate * largest_diameter) * look_ahead
+        skin = min(max(least_skin, usual_skin), widest_skin)
+        pair_count, skin, fits = search(grains, pairs, side, tilt, largest_diameter, skin)
+        closing_speed = closing_speed_bound(max_speed, shear_rate, largest_diameter + skin)
+        slack = skin - closing_speed * look_ahead
+        if slack < 0.0 or not fits:
+            status = max(status, CAPACITY)
+        if not closing_speed < math.inf:
+            status = NONFINITE
             break
-        if resume_at == WITHIN_LIST:
-            resume_at, new_list = 0, False
-            k, pair_count, skin, closing_speed = (
-                saved.k,
-                saved.pair_count,
-                saved.skin,
-                saved.closing_speed,
-            )
-            slack, max_speed = saved.slack, saved.max_speed
-            kinetic = saved.kinetic_xx, saved.kinetic_xy, saved.kinetic_yy
-        else:
-            k, new_list = 0, True  # steps since the search
-            max_speed = bring_into_cell(grains, side, tilt, shear_rate)
-            kinetic = kinetic_sums(grains, shear_rate)
-            # what one step may need
-            least_skin = (
-                1.2 * (2 * max_speed * (1 + LIFE) + shear_rate * largest_diameter) * look_ahead
-            )
-            skin = min(max(least_skin, usual_skin), widest_skin)
-            pair_count, skin, fits = search(grains, pairs, side, tilt, largest_diameter, skin)
-            closing_speed = closing_speed_bound(max_speed, shear_rate, largest_diameter + skin)
-            slack = skin - closing_speed * look_ahead
-            if slack < 0.0 or not fits:
-                status = max(status, CAPACITY)
-            if not closing_speed < math.inf:
-                status = NONFINITE
-                break
-            valid = min(slack / closing_speed if closing_speed > 0.0 else math.inf, life)
-            horizon = max(valid, dt) + look_ahead
-            for p in range(pair_count):
-                pairs.listed[p] = p
-            predict_contact_steps(pair_count, 0.0, solved, horizon, 0, flow, grains, pairs)
+        valid = min(slack / closing_speed if closing_speed > 0.0 else math.inf, life)
+        horizon = max(valid, dt) + look_ahead
+        for p in range(pair_count):
+            pairs.listed[p] = p
+        predict_contact_steps(pair_count, 0.0, solved, horizon, 0, flow, grains, pairs)
         entries = clear_calendar(pair_count, pairs)
-        list_steps = max(min(slack / closing_speed, life - k * dt) / dt, 1.0)
+        list_steps = max(min(slack / closing_speed, life) / dt, 1.0)
         shift = choose_blocks(entries, list_steps, pairs)
         if shift > 0:
             bound_blocks(entries, shift, pairs)
 
         if room > 0:
-            t = k * dt
-            record_flight(
-                records[recorded],
-                steps_before_list + k,
-                solved,
-                tilt + shear_rate * t,
-                t,
-                shear_rate,
-                grains,
-                order.in_state,
-            )
-            recorded += 1
+            record_flight(records[0], 0, solved, tilt, 0.0, shear_rate, grains)
+            recorded = 1
         while True:
             # The next step to visit is that of a contact, the end of the list's life, or that of
             # the advance. A new list lasts to the next step, where it is renewed.
@@ -222,7 +187,7 @@ def advance_loop(
             kinetic = add_flight(sums, k - last_k, flight, shear_rate * flight, kinetic)
             slack -= closing_speed * flight
             solved = solved if k == last_k else 0
-            if stop[0] != 0:
+            if shared[STOP] != 0:
                 status = FAILED
                 break
             t, block_ends = k * dt, steps_before_list + k >= block_end
@@ -257,19 +222,9 @@ def advance_loop(
             status = max(status, CAPACITY if overfull else OK, outcome)
             solved = 1
             if room > 0:
-                record_flight(
-                    records[recorded],
-                    steps_before_list + k,
-                    solved,
-                    tilt + shear_rate * t,
-                    t,
-                    shear_rate,
-                    grains,
-                    order.in_state,
-                )
-                record_contacts(
-                    records[recorded], contacts, flow.one_plus_alpha, order.in_state, network
-                )
+                record = records[recorded]
+                record_flight(record, k, solved, tilt + shear_rate * t, t, shear_rate, grains)
+                record_contacts(record, contacts, flow.one_plus_alpha, grains, network)
                 recorded += 1
             kinetic, max_speed, finite = strike(
                 touched_count, t, shear_rate, grains, network, clusters, kinetic, max_speed
@@ -291,33 +246,26 @@ def advance_loop(
                     sums,
                 )
                 collisions_read = sums[COLLISIONS]
+            if 0 < room == recorded:
+                break
             slack -= (closing_speed - last_speed) * look_ahead
             horizon = max(min(slack / closing_speed, life - t), dt) + look_ahead
             listed = list_struck_pairs(
                 k, touched_count, pair_count if overfull else contacts, overfull, pairs, network
             )
             predict_contact_steps(listed, t, k + 1, horizon, shift, flow, grains, pairs)
-            if 0 < room == recorded:
-                suspended = WITHIN_LIST
-                break
 
-        if suspended > 0:
-            saved.k, saved.pair_count, saved.skin = k, pair_count, skin
-            saved.closing_speed, saved.slack, saved.max_speed = closing_speed, slack, max_speed
-            saved.kinetic_xx, saved.kinetic_xy, saved.kinetic_yy = kinetic
-            break
         steps_before_list += k
         tilt = remap_tilt(tilt + shear_rate * k * dt)
         move_grains(k * dt, grains)
+        if room > 0:
+            break
 
-    if suspended > 0:
-        for n in range(NUMBERS):
-            saved_sums[n] = sums[n]
-        saved.tilt, saved.largest_diameter = tilt, largest_diameter
-        saved.steps_before_list, saved.solved, saved.status = steps_before_list, solved, status
-        saved.collisions_read = collisions_read
-    elif steps_before_list > 0:
-        write_state(order.in_state, side, tilt, shear_rate, grains, new_positions, new_velocities)
+    unfinished = steps_before_list < all_steps and status < NONFINITE
+    if unfinished:
+        write_motion(grains, new_positions, new_velocities)
+    elif steps_before_list > 0 or goes_on:
+        write_state(side, tilt, shear_rate, grains, new_positions, new_velocities)
     else:  # as it was, to the bit
         for g in range(count):
             new_positions[g, 0], new_positions[g, 1] = image_in_cell(
@@ -328,7 +276,8 @@ def advance_loop(
     for b in range(block, blocks):
         results[b, STATUS] = status
     sums = results[blocks - 1]
-    sums[TILT], sums[SUSPENDED], sums[RECORDED] = tilt, suspended, recorded
+    sums[TILT], sums[UNFINISHED], sums[RECORDED] = tilt, unfinished, recorded
+    sums[SOLVED], sums[READ] = solved, collisions_read
 
 
 @njit
@@ -339,9 +288,9 @@ def _end_block(t, tilt, side, shear_rate, kinetic, status, grains, clusters, ste
     motion, constants = grains.motion, grains.constants
     read_velocity_scales(t, tilt, side, shear_rate, grains, clusters.matrices, step_sums, sums)
     px = py = total = 0.0
-    for g in range(motion.shape[0]):
-        cx, cy = motion[g, VX] - shear_rate * (motion[g, Y] + motion[g, VY] * t), motion[g, VY]
-        mass = 1 / constants[g, INVERSE_MASS]
+    for g in range(motion.size):
+        cx, cy = motion[g].vx - shear_rate * (motion[g].y + motion[g].vy * t), motion[g].vy
+        mass = 1 / constants[g].inverse_mass
         px += mass * cx
         py += mass * cy
         total += mass * math.sqrt(cx * cx + cy * cy)

@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.numba_engine.compilation import CELL, inline_njit, njit, whole_part
-from jaxgran.dynamics.numba_engine.layout import INVERSE_MASS, RADIUS, VX, VY, X, Y
+from jaxgran.dynamics.numba_engine.compilation import CELL, njit, whole_part
 
 image_in_cell = CELL["image_in_cell"]
 
@@ -13,11 +12,11 @@ _CACHED_GRAINS, _ROW_HEIGHT = 2000, 2.0  # larger flows are put in order, in cel
 
 
 @njit
-def put_in_order(positions, side, tilt, order):
+def put_in_order(positions, side, tilt, grains, pairs):
     """Write an order of the grains, row by row, that keeps neighbours close in memory if a flow
-    outgrows the caches.
+    outgrows the caches; ``pairs`` has memory for the sorting.
     """
-    in_state, cells, starts, count = order.in_state, order.cells, order.starts, order.in_state.size
+    in_state, cells, starts, count = grains.in_state, pairs.cells, pairs.starts, len(positions)
     across = 1
     if count > _CACHED_GRAINS:
         across = max(1, whole_part(side / _ROW_HEIGHT, math.sqrt(count)))
@@ -39,73 +38,83 @@ def put_in_order(positions, side, tilt, order):
 
 
 @njit
-def read_state(positions, velocities, radii, masses, in_state, shear_rate, grains):
+def read_state(positions, velocities, radii, masses, shear_rate, grains):
     """Copy the grains, with velocities of the laboratory; returns the largest diameter and whether
     all is finite.
     """
-    motion, constants = grains.motion, grains.constants
+    motion, constants, in_state = grains.motion, grains.constants, grains.in_state
     largest_diameter, finite = 0.0, True
     for g in range(in_state.size):
         n = in_state[g]
-        motion[g, X], motion[g, Y] = positions[n, 0], positions[n, 1]
-        motion[g, VX] = velocities[n, 0] + shear_rate * positions[n, 1]
-        motion[g, VY] = velocities[n, 1]
-        constants[g, RADIUS], constants[g, INVERSE_MASS] = radii[n], 1 / masses[n]
+        motion[g].x, motion[g].y = positions[n, 0], positions[n, 1]
+        motion[g].vx = velocities[n, 0] + shear_rate * positions[n, 1]
+        motion[g].vy = velocities[n, 1]
+        constants[g].radius, constants[g].inverse_mass = radii[n], 1 / masses[n]
         largest_diameter = max(largest_diameter, 2 * radii[n])
-        for a in range(4):
-            finite &= abs(motion[g, a]) < math.inf
+        finite &= abs(motion[g].x) < math.inf and abs(motion[g].y) < math.inf
+        finite &= abs(motion[g].vx) < math.inf and abs(motion[g].vy) < math.inf
     return largest_diameter, finite
 
 
-@inline_njit
+@njit
 def bring_into_cell(grains, side, tilt, shear_rate):
     """Bring the grains into the cell, at the same peculiar velocities; returns the largest peculiar
     speed.
     """
     motion = grains.motion
     squared_speed = 0.0
-    for g in range(motion.shape[0]):
-        cx, cy = motion[g, VX] - shear_rate * motion[g, Y], motion[g, VY]
-        row = np.floor(motion[g, Y] / side)
-        motion[g, Y] -= row * side
-        motion[g, X] -= row * tilt * side
-        motion[g, X] -= np.floor((motion[g, X] - tilt * motion[g, Y]) / side) * side
-        motion[g, VX] = cx + shear_rate * motion[g, Y]
+    for g in range(motion.size):
+        cx, cy = motion[g].vx - shear_rate * motion[g].y, motion[g].vy
+        row = np.floor(motion[g].y / side)
+        motion[g].y -= row * side
+        motion[g].x -= row * tilt * side
+        motion[g].x -= np.floor((motion[g].x - tilt * motion[g].y) / side) * side
+        motion[g].vx = cx + shear_rate * motion[g].y
         squared_speed = max(squared_speed, cx * cx + cy * cy)
     return math.sqrt(squared_speed)
 
 
-@inline_njit
+@njit
 def kinetic_sums(grains, shear_rate):
     """Σ m c_x c_x, Σ m c_x c_y and Σ m c_y c_y, just after a search."""
     motion, constants = grains.motion, grains.constants
     xx = xy = yy = 0.0
-    for g in range(motion.shape[0]):
-        cx, cy = motion[g, VX] - shear_rate * motion[g, Y], motion[g, VY]
-        mass = 1 / constants[g, INVERSE_MASS]
+    for g in range(motion.size):
+        cx, cy = motion[g].vx - shear_rate * motion[g].y, motion[g].vy
+        mass = 1 / constants[g].inverse_mass
         xx += mass * cx * cx
         xy += mass * cx * cy
         yy += mass * cy * cy
     return xx, xy, yy
 
 
-@inline_njit
+@njit
 def move_grains(t, grains):
     """Move the grains to their positions at the time t since the search."""
     motion = grains.motion
-    for g in range(motion.shape[0]):
-        motion[g, X] += motion[g, VX] * t
-        motion[g, Y] += motion[g, VY] * t
+    for g in range(motion.size):
+        motion[g].x += motion[g].vx * t
+        motion[g].y += motion[g].vy * t
 
 
 @njit
-def write_state(in_state, side, tilt, shear_rate, grains, new_positions, new_velocities):
+def write_state(side, tilt, shear_rate, grains, new_positions, new_velocities):
     """Write the positions, in the cell, and the peculiar velocities of the grains."""
     motion = grains.motion
-    for g in range(in_state.size):
-        n = in_state[g]
+    for g in range(motion.size):
+        n = grains.in_state[g]
         new_positions[n, 0], new_positions[n, 1] = image_in_cell(
-            motion[g, X], motion[g, Y], side, tilt
+            motion[g].x, motion[g].y, side, tilt
         )
-        new_velocities[n, 0] = motion[g, VX] - shear_rate * motion[g, Y]
-        new_velocities[n, 1] = motion[g, VY]
+        new_velocities[n, 0] = motion[g].vx - shear_rate * motion[g].y
+        new_velocities[n, 1] = motion[g].vy
+
+
+@njit
+def write_motion(grains, new_positions, new_velocities):
+    """Write the positions as they are, and the velocities in the laboratory."""
+    motion = grains.motion
+    for g in range(motion.size):
+        n = grains.in_state[g]
+        new_positions[n, 0], new_positions[n, 1] = motion[g].x, motion[g].y
+        new_velocities[n, 0], new_velocities[n, 1] = motion[g].vx, motion[g].vy

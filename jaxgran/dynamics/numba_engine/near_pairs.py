@@ -4,15 +4,12 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.numba_engine.compilation import CELL, inline_njit, njit, whole_part
+from jaxgran.dynamics.numba_engine.compilation import CELL, njit, whole_part
 from jaxgran.dynamics.numba_engine.layout import (
     FIRST,
     IMAGE_ROW,
     IMAGE_X,
-    RADIUS,
     SECOND,
-    X,
-    Y,
 )
 
 nearest_image = CELL["nearest_image"]
@@ -22,7 +19,7 @@ LIFE = 0.1
 _ATTEMPTS = 12  # with ever narrower skins, while a list has more pairs than room
 
 
-@inline_njit
+@njit
 def closing_speed_bound(max_speed, shear_rate, distance):
     """Bound on how fast the gap of a pair within a distance closes while a list is valid, see
     ``dynamics.step``.
@@ -63,7 +60,7 @@ def find_near_pairs(grains, pairs, side, tilt, reach, skin, capacity):
     return _pairs_of_all(grains, pairs, side, tilt, skin, capacity)
 
 
-@inline_njit
+@njit
 def _sort_into_cells(grains, pairs, side, tilt, rows, columns):
     """Sort the grains into cells row by row, those of a cell at ``starts[cell] : starts[cell +
     1]``.
@@ -72,25 +69,25 @@ def _sort_into_cells(grains, pairs, side, tilt, rows, columns):
     starts, cells, sorted_grains, places = pairs.starts, pairs.cells, pairs.sorted, pairs.places
     for cell in range(rows * columns + 1):
         starts[cell] = 0
-    for g in range(motion.shape[0]):
-        row = whole_part(motion[g, Y] / side * rows, rows - 1)
-        fraction = (motion[g, X] - tilt * motion[g, Y]) / side
+    for g in range(motion.size):
+        row = whole_part(motion[g].y / side * rows, rows - 1)
+        fraction = (motion[g].x - tilt * motion[g].y) / side
         cells[g] = row * columns + whole_part(fraction * columns, columns - 1)
         starts[cells[g] + 1] += 1
     for cell in range(rows * columns):
         starts[cell + 1] += starts[cell]
     # A cell is filled from its end, which moves to its beginning
-    for g in range(motion.shape[0] - 1, -1, -1):
+    for g in range(motion.size - 1, -1, -1):
         starts[cells[g] + 1] -= 1
         n = starts[cells[g] + 1]
         sorted_grains[n] = g
-        places[0, n], places[1, n], places[2, n] = motion[g, X], motion[g, Y], constants[g, RADIUS]
+        places[0, n], places[1, n], places[2, n] = motion[g].x, motion[g].y, constants[g].radius
     for cell in range(rows * columns):
         starts[cell] = starts[cell + 1]
-    starts[rows * columns] = motion.shape[0]
+    starts[rows * columns] = motion.size
 
 
-@inline_njit
+@njit
 def _pairs_of_cells(pairs, side, tilt, rows, columns, skin, capacity):
     """Pairs within each cell, with its right neighbour, and with the three above it."""
     starts, sorted_grains, places = pairs.starts, pairs.sorted, pairs.places
@@ -136,18 +133,18 @@ def _pairs_of_cells(pairs, side, tilt, rows, columns, skin, capacity):
     return count
 
 
-@inline_njit
+@njit
 def _pairs_of_all(grains, pairs, side, tilt, skin, capacity):
     """Compare all pairs by nearest images, in a periodic cell too small for a grid of 3×3."""
     motion, constants, ends, images = grains.motion, grains.constants, pairs.ends, pairs.images
     count = 0
-    for i in range(motion.shape[0]):
+    for i in range(motion.size):
         for j in range(i):
-            dx, dy = motion[i, X] - motion[j, X], motion[i, Y] - motion[j, Y]
+            dx, dy = motion[i].x - motion[j].x, motion[i].y - motion[j].y
             column, row = nearest_image(dx, dy, side, tilt)
             image_x = column * side + row * tilt * side
             dx, dy = dx - image_x, dy - row * side
-            reach = constants[i, RADIUS] + constants[j, RADIUS] + skin
+            reach = constants[i].radius + constants[j].radius + skin
             if dx * dx + dy * dy <= reach * reach:
                 if count < capacity:
                     ends[FIRST, count], ends[SECOND, count] = i, j
@@ -156,7 +153,7 @@ def _pairs_of_all(grains, pairs, side, tilt, skin, capacity):
     return count
 
 
-@inline_njit
+@njit
 def _index_pairs(pairs, count):
     """The pairs of grain g are those in ``of_grain[offsets[g] : offsets[g + 1]]``."""
     ends, offsets, of_grain = pairs.ends, pairs.offsets, pairs.of_grain

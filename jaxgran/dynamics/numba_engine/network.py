@@ -3,23 +3,21 @@
 import math
 
 from jaxgran.dynamics.numba_engine.calendar import pair_motion
-from jaxgran.dynamics.numba_engine.compilation import inline_njit
+from jaxgran.dynamics.numba_engine.compilation import njit
 from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     DISTANCE,
     DONE,
     FIRST,
     IMPULSE,
-    INVERSE_MASS,
     NX,
     NY,
-    RADIUS,
     SECOND,
     WAITING,
 )
 
 
-@inline_njit
+@njit
 def make_network(contacts, t, flow, grains, pairs, network):
     """Write the contacts of a step and their grains; returns the number of the grains, Σ min(0,
     u⁻)² and the largest overlap.
@@ -35,9 +33,7 @@ def make_network(contacts, t, flow, grains, pairs, network):
         ends[FIRST, c], ends[SECOND, c] = i, j
         rows[NX, c], rows[NY, c], rows[APPROACH, c] = dx, dy, approach
         rows[DISTANCE, c], rows[IMPULSE, c] = distance, 0.0
-        largest_overlap = max(
-            largest_overlap, constants[i, RADIUS] + constants[j, RADIUS] - distance
-        )
+        largest_overlap = max(largest_overlap, constants[i].radius + constants[j].radius - distance)
         scale += min(approach, 0.0) * approach
         for end in range(2):
             g = ends[end, c]
@@ -48,7 +44,7 @@ def make_network(contacts, t, flow, grains, pairs, network):
     return touched_count, scale, largest_overlap
 
 
-@inline_njit
+@njit
 def solve_isolated(contacts, grains, network):
     """Write the impulses of isolated pairs; returns the number of the other contacts."""
     ends, rows, degree, constants = network.ends, network.rows, network.degree, grains.constants
@@ -56,14 +52,14 @@ def solve_isolated(contacts, grains, network):
     for c in range(contacts):
         i, j = ends[FIRST, c], ends[SECOND, c]
         if degree[i] == 1 and degree[j] == 1:
-            mobility = constants[i, INVERSE_MASS] + constants[j, INVERSE_MASS]
+            mobility = constants[i].inverse_mass + constants[j].inverse_mass
             rows[IMPULSE, c] = max(0.0, -rows[APPROACH, c]) / mobility
         else:
             coupled += 1
     return coupled
 
 
-@inline_njit
+@njit
 def find_clusters(contacts, touched_count, network, clusters):
     """Find the clusters in which a contact approaches, each by a breadth-first search from such a
     contact.
@@ -114,7 +110,7 @@ def find_clusters(contacts, touched_count, network, clusters):
     return count
 
 
-@inline_njit
+@njit
 def sum_impulses(contacts, touched_count, one_plus_alpha, network):
     """Add up the impulses on every grain, and its contacts that carry one."""
     ends, rows, touched = network.ends, network.rows, network.touched

@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
@@ -12,9 +11,13 @@ from jaxtyping import Array
 from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.network import MOST_CONTACTS, Contacts
 from jaxgran.contact.projected_methods import ProjectedMethod
-from jaxgran.dynamics.jax_engine import ended
 from jaxgran.dynamics.numba_engine import layout
-from jaxgran.dynamics.numba_engine.call import NumbaCall, call_numba, numba_memory
+from jaxgran.dynamics.numba_engine.call import (
+    NumbaCall,
+    call_numba,
+    ended_by_numba,
+    first_row,
+)
 from jaxgran.dynamics.observer import (
     Observe,
     added,
@@ -23,17 +26,16 @@ from jaxgran.dynamics.observer import (
     without_contacts,
 )
 from jaxgran.dynamics.snapshot import flown
-from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
+from jaxgran.dynamics.tally import Tally, place_of
 from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 
-_MOST_ROOM, _LEAST_ROOM = (
-    64,
-    2,
-)  # records of one call; the least are those of a list and of its first contacts
+_MOST_ROOM = 320  # records of one call; usual lists have some 10 to 300, mostly of small time steps
+_LEAST_ROOM = 2  # those of a list and of its first contacts
 _MOST_BYTES = 2**26  # of the records of one call, above 170,000 grains those of the least
+_STEPS = place_of("steps")
 _FEW = 16  # grains for a slot in the smaller one of two buffers for contacts
 
 
@@ -43,13 +45,14 @@ def records_of_call(grains: int) -> int:
 
 
 class _Progress(NamedTuple):
-    """An advance by one call of the numba engine after another, see ``NumbaCall``."""
+    """An advance by one call of the numba engine after another: whether the last one is unfinished,
+    the grains as it has left them, and its last row.
+    """
 
     unfinished: Array
-    end: State
-    sums: RunningSums
-    suspended: Array
-    memory: Array
+    state: State
+    row: Array
+    user_sums: Any
 
 
 def observe_by_numba(
@@ -57,39 +60,35 @@ def observe_by_numba(
 ) -> tuple[State, Tally]:
     """Advance one replica, and sum over all time steps what a function finds in them.
 
-    The engine does not call the function. It records the steps that it visits until the buffer of
-    records is full; then JAX applies the function to the records, and the engine goes on where it
-    was suspended. So only the function is compiled, not an engine, and the trajectory is that of
-    ``advance_by_numba`` to the bit.
+    The engine does not call the function. It records the steps that it visits until its list of
+    near pairs ends; then JAX applies the function to the records, and the next call goes on from
+    there. So only the function is compiled, not an engine. The trajectory is that of
+    ``advance_by_numba`` to the bit, but for rounding where the steps of a list outnumber the
+    records, or in flows so large that the engine puts its grains in order.
     """
-
-    room = records_of_call(flow.grains)
+    dtype, room = state.positions.dtype, records_of_call(flow.grains)
 
     def called(now: _Progress) -> _Progress:
-        call = call_numba(flow, solver, state, steps[None], room, now.suspended, now.memory)
-        sums = jax.tree.map(lambda x: x[0], call.sums)
-        end_step = sums.value("steps")
-        user_sums = _with_records(flow, state, observe, now.sums.user_sums, call, end_step)
-        sums = sums._replace(user_sums=user_sums)
-        return _Progress(call.suspended > 0, call.end, sums, call.suspended, call.memory)
+        done = now.row[_STEPS]
+        call = call_numba(flow, solver, now.state, steps[None].astype(dtype) - done, now.row, room)
+        row = call.blocks[0]
+        left = replace(now.state, positions=call.positions, velocities=call.velocities)
+        user_sums = _with_records(flow, state, observe, now.user_sums, call, row[_STEPS] - done)
+        return _Progress(row[layout.UNFINISHED] > 0, left, row, user_sums)
 
-    dtype = state.positions.dtype
     at_start = observe_at(observe, flow, state)
-    sums = empty_sums(dtype)._replace(
-        user_sums=nothing_observed(at_start, MOST_CONTACTS * flow.grains, dtype).sums
-    )
-    memory = jnp.zeros(numba_memory(flow).shape, dtype)
-    start = _Progress(jnp.bool_(True), state, sums, jnp.zeros((), dtype), memory)
-    end, sums = lax.while_loop(lambda now: now.unfinished, called, start)[1:3]
-    after, tally = ended(state, end.positions, end.tilt, end.velocities, sums)
-    return after, replace(tally, observed=sums.user_sums)
+    nothing = nothing_observed(at_start, MOST_CONTACTS * flow.grains, dtype).sums
+    start = _Progress(jnp.bool_(True), state, first_row(flow, state), nothing)
+    end = lax.while_loop(lambda now: now.unfinished, called, start)
+    after, tally = ended_by_numba(state, end.state, end.row)
+    return after, replace(tally, observed=end.user_sums)
 
 
 def _with_records(
     flow: ShearFlow, state: State, observe: Observe, user_sums: Any, call: NumbaCall, steps: Array
 ) -> Any:
-    """The user sums with what is found in the records of a call, up to the step ``steps``."""
-    records, count = call.records, call.recorded
+    """The user sums with what is found in the records of a call of so many steps."""
+    records, count = call.records, call.blocks[0, layout.RECORDED].astype(jnp.int32)
     dtype = records.dtype
     timestep, shear_rate = (jnp.asarray(x, dtype) for x in (flow.timestep, flow.shear_rate))
     most = MOST_CONTACTS * flow.grains

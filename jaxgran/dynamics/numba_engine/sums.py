@@ -3,17 +3,15 @@
 """
 
 from jaxgran.contact.law import SolvedContact
-from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit
+from jaxgran.dynamics.numba_engine.compilation import LAW, njit
 from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     DISTANCE,
     FIRST,
     IMPULSE,
-    INVERSE_MASS,
     NX,
     NY,
     OK,
-    RADIUS,
     SECOND,
 )
 from jaxgran.dynamics.tally import CONTACT, place_of, span_of
@@ -32,7 +30,7 @@ _UNCONVERGED = place_of("unconverged")
 _LARGEST_OVERLAP, _WORST_RESIDUAL = place_of("largest_overlap"), place_of("worst_residual")
 
 
-@inline_njit
+@njit
 def add_flight(sums, steps, flight, strain, kinetic):
     """Add a flight of so many steps, with Σ m c ⊗ c at its beginning, and return that at its end.
 
@@ -48,7 +46,7 @@ def add_flight(sums, steps, flight, strain, kinetic):
     return xx + strain * (strain * yy - 2 * xy), xy - strain * yy, yy
 
 
-@inline_njit
+@njit
 def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
     """Add what the contacts of one step contribute, by the law of a contact; ``step_sums`` is
     memory for it.
@@ -60,7 +58,7 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
     for c in range(contacts):
         i, j = ends[FIRST, c], ends[SECOND, c]
         nx, ny, approach, distance = rows[NX, c], rows[NY, c], rows[APPROACH, c], rows[DISTANCE, c]
-        mi, mj = constants[i, INVERSE_MASS], constants[j, INVERSE_MASS]
+        mi, mj = constants[i].inverse_mass, constants[j].inverse_mass
         impulse = one_plus_alpha * rows[IMPULSE, c]
         change = nx * (impulses[i, 0] * mi - impulses[j, 0] * mj) + ny * (
             impulses[i, 1] * mi - impulses[j, 1] * mj
@@ -69,7 +67,7 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
             nx,
             ny,
             distance,
-            max(constants[i, RADIUS] + constants[j, RADIUS] - distance, 0.0),
+            max(constants[i].radius + constants[j].radius - distance, 0.0),
             approach,
             change / 2,
             one_plus_alpha,
@@ -88,7 +86,7 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
         sums[_FIRST_TERM + n] += step_sums[n]
 
 
-@inline_njit
+@njit
 def add_solve(sums, iterations, residual, status, overlap):
     """Add one solve."""
     sums[_SOLVES] += 1

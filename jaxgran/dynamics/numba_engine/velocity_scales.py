@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from jaxgran.dynamics.numba_engine.compilation import CELL, njit, whole_part
-from jaxgran.dynamics.numba_engine.layout import INVERSE_MASS, VX, VY, X, Y
 from jaxgran.dynamics.tally import place_of
 from jaxgran.dynamics.velocity_scales import BOX_GRAINS, WAVES
 
@@ -28,7 +27,7 @@ def read_velocity_scales(t, tilt, side, shear_rate, grains, boxes, amplitudes, r
       amplitudes: memory for ``_AMPLITUDES`` numbers.
       results: the running sums.
     """
-    motion, constants, count = grains.motion, grains.constants, grains.motion.shape[0]
+    motion, constants, count = grains.motion, grains.constants, grains.motion.size
     across = max(1, int(np.rint(math.sqrt(count / BOX_GRAINS))))
     tilt = remap_tilt(tilt)
     for box in range(across * across):
@@ -37,8 +36,8 @@ def read_velocity_scales(t, tilt, side, shear_rate, grains, boxes, amplitudes, r
         amplitudes[n] = 0.0
     energy, total = 0.0, 0.0  # Σ m c² and Σ m
     for g in range(count):
-        x, y = motion[g, X] + motion[g, VX] * t, motion[g, Y] + motion[g, VY] * t
-        cx, cy, mass = motion[g, VX] - shear_rate * y, motion[g, VY], 1 / constants[g, INVERSE_MASS]
+        x, y = motion[g].x + motion[g].vx * t, motion[g].y + motion[g].vy * t
+        cx, cy, mass = motion[g].vx - shear_rate * y, motion[g].vy, 1 / constants[g].inverse_mass
         sx, sy = (x - tilt * y) / side, y / side
         sx, sy = sx - np.floor(sx), sy - np.floor(sy)
         px, py = mass * cx, mass * cy
