@@ -33,7 +33,6 @@ from jaxgran.dynamics.engine import Jax, Numba, engine_named
 from jaxgran.dynamics.numba_engine import arrays, cluster_solver
 from jaxgran.dynamics.numba_engine.ffi import engine_folder
 from jaxgran.dynamics.numba_engine.near_pairs import LIFE, closing_speed_bound, find_near_pairs
-from jaxgran.dynamics.step import LONGEST_FLIGHT
 from jaxgran.dynamics.tally import TABLE
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
@@ -41,6 +40,7 @@ from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
 LOOSE = BarzilaiBorwein(1e-6, 10**6)
+LOOK_AHEAD = 0.05  # strain, of the longest time step
 
 
 @pytest.fixture(scope="module")
@@ -345,7 +345,7 @@ def test_a_traced_number_that_cannot_be_ends_its_replica_and_no_other(engine) ->
     fastest=st.floats(0.1, 10),
     distance=st.floats(0.8, 3),
     angles=st.tuples(*[st.floats(0, 2 * np.pi)] * 3),
-    strain=st.floats(1e-6, LIFE),
+    strain=st.floats(1e-6, LIFE + LOOK_AHEAD),
     shear_rate=st.sampled_from([1.0, 3.0]),
 )
 @example(
@@ -362,23 +362,30 @@ def test_no_pair_closes_by_more_than_its_list_loses_of_the_skin(
     velocity = fastest * np.array([ci - cj, si - sj]) + [shear_rate * apart[1], 0]
     time = strain / shear_rate
     closed = distance - np.linalg.norm(apart + velocity * time)
-    assert closed <= closing_speed_bound.py_func(fastest, shear_rate, distance) * time * (1 + 1e-12)
+    look_ahead = LOOK_AHEAD / shear_rate
+    bound = closing_speed_bound.py_func(fastest, shear_rate, distance, look_ahead)
+    assert closed <= bound * time * (1 + 1e-12)
 
 
 @pytest.mark.parametrize("speed", [0.3, 3.0])
 def test_bound_of_closing_includes_that_speeds_grow_within_a_flight(engine, speed) -> None:
-    """A pair that stretches with the shear reaches the skin at the end of the longest flight."""
-    longest, skin = {"numba": LIFE, "jax": LONGEST_FLIGHT}[engine], 0.2
+    """A pair that stretches with the shear reaches the skin in the look-ahead of the last step of
+    the longest flight, or of the longest step.
+    """
+    longest, skin = {"numba": LIFE, "jax": 2 * LOOK_AHEAD}[engine] + LOOK_AHEAD, 0.2
     normal = np.array([1, -1]) / np.sqrt(2)
     velocities = speed * np.stack([-normal, normal])
     later = velocities - longest * velocities[:, 1:] * [1, 0]
     closing = np.dot(later[1] - later[0], normal) + (1 + skin) / 2
     if engine == "numba":
-        bound = closing_speed_bound.py_func(speed, 1.0, 1 + skin)
+        bound = closing_speed_bound.py_func(speed, 1.0, 1 + skin, LOOK_AHEAD)
     else:
         grains = Grains(jnp.full(2, 0.5), jnp.ones(2))
         bound = step.closing_speed_bound(
-            ShearFlow(32, 0.5, 0.5, 1e-3), grains, jnp.asarray(velocities), jnp.asarray(skin)
+            ShearFlow(32, 0.5, 0.5, 2 * LOOK_AHEAD),
+            grains,
+            jnp.asarray(velocities),
+            jnp.asarray(skin),
         )
     assert closing <= bound <= closing + 2 * speed * longest
 

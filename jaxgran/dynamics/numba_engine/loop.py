@@ -150,10 +150,16 @@ def advance_loop(
         max_speed = bring_into_cell(grains, side, tilt, shear_rate)
         kinetic = kinetic_sums(grains, shear_rate)
         # what one step may need
-        least_skin = 1.2 * (2 * max_speed * (1 + LIFE) + shear_rate * largest_diameter) * look_ahead
+        least_skin = (
+            1.2
+            * look_ahead
+            * closing_speed_bound(max_speed, shear_rate, 2 * largest_diameter, look_ahead)
+        )
         skin = min(max(least_skin, usual_skin), widest_skin)
         pair_count, skin, fits = search(grains, pairs, side, tilt, largest_diameter, skin)
-        closing_speed = closing_speed_bound(max_speed, shear_rate, largest_diameter + skin)
+        closing_speed = closing_speed_bound(
+            max_speed, shear_rate, largest_diameter + skin, look_ahead
+        )
         slack = skin - closing_speed * look_ahead
         if slack < 0.0 or not fits:
             status = max(status, CAPACITY)
@@ -230,7 +236,9 @@ def advance_loop(
                 touched_count, t, shear_rate, grains, network, clusters, kinetic, max_speed
             )
             last_speed = closing_speed
-            closing_speed = closing_speed_bound(max_speed, shear_rate, largest_diameter + skin)
+            closing_speed = closing_speed_bound(
+                max_speed, shear_rate, largest_diameter + skin, look_ahead
+            )
             if not (finite and closing_speed < math.inf):
                 status = NONFINITE
                 break

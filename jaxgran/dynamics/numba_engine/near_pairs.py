@@ -20,11 +20,11 @@ _ATTEMPTS = 12  # with ever narrower skins, while a list has more pairs than roo
 
 
 @njit
-def closing_speed_bound(max_speed, shear_rate, distance):
-    """Bound on how fast the gap of a pair within a distance closes while a list is valid, see
-    ``dynamics.step``.
+def closing_speed_bound(max_speed, shear_rate, distance, look_ahead):
+    """Bound on how fast the gap of a pair within a distance closes while a list is valid and in the
+    look-ahead beyond, see ``dynamics.step``.
     """
-    return 2 * max_speed * (1 + LIFE) + shear_rate * distance / 2
+    return 2 * max_speed * (1 + LIFE + shear_rate * look_ahead) + shear_rate * distance / 2
 
 
 @njit
