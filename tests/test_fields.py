@@ -18,7 +18,7 @@ from scipy.integrate import quad
 from jaxgran.analysis import fields as fields_module
 from jaxgran.analysis.fields import Fields, fields_at, grid
 from jaxgran.contact.network import Contacts
-from jaxgran.dynamics.snapshot import Snapshot, collided, flown
+from jaxgran.dynamics.snapshot import Snapshot, free_flight, collided
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.model.cell import displacement, wrap
 from jaxgran.model.flow import ShearFlow
@@ -135,7 +135,9 @@ def rate_in_flight(state, points, width):
     """∂/∂t of the densities in free flight."""
     now, unit = jnp.asarray(0.0), jnp.asarray(1.0)
     return jax.jvp(
-        lambda time: densities_of(flown(state, 1.0, time), points, width), (now,), (unit,)
+        lambda time: densities_of(free_flight(state, 1.0, time), points, width),
+        (now,),
+        (unit,),
     )[1]
 
 
@@ -194,7 +196,7 @@ def test_a_step_of_the_engine_is_balanced_to_the_order_of_its_flight(
         )
         diverging, loss = outflow_of_step(now, points, width)
         begun, halfway = (
-            outflow_in_flight(flown(collided(now), 1.0, t), points, width)
+            outflow_in_flight(free_flight(collided(now), 1.0, t), points, width)
             for t in (0, timestep / 2)
         )
         first = (end - begin) / timestep + diverging + loss[:, None] * jnp.asarray([[0, 0, 0, 1.0]])

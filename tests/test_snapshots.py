@@ -13,7 +13,7 @@ from oracles import nearest_image
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from jaxgran.dynamics.snapshot import collided, flown
+from jaxgran.dynamics.snapshot import free_flight, collided
 from jaxgran.dynamics.snapshots import snapshot, snapshot_series
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
@@ -44,7 +44,7 @@ def test_collision_and_flight_are_the_two_halves_of_a_step(flow, flowing, run) -
     for _ in range(40):
         seen = one_snapshot(flow, state, EXACT)
         loaded += int(jnp.sum(seen.impulses > 0))
-        by_halves = flown(collided(seen), flow.shear_rate, flow.timestep)
+        by_halves = free_flight(collided(seen), flow.shear_rate, flow.timestep)
         state, _ = run(flow, state, 1)
         assert_same_flow(by_halves, state, 1e-12)
     assert loaded > 20  # so that there was something to compare
@@ -99,7 +99,7 @@ def test_forces_push_and_add_nothing_to_the_momentum(series) -> None:
 
 def test_flight_there_and_back_is_where_it_started(flow, flowing) -> None:
     state = flowing(0.78)
-    assert_same_flow(flown(flown(state, 1.0, 0.7), 1.0, -0.7), replace(state), 1e-12)
+    assert_same_flow(free_flight(free_flight(state, 1.0, 0.7), 1.0, -0.7), replace(state), 1e-12)
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from jaxtyping import Float
 
 from jaxgran.dynamics.batching import in_lockstep
 from jaxgran.dynamics.engine import Numba, Numerics, select_engine
-from jaxgran.dynamics.interruption import PATIENCE, engines_stopped, waited
+from jaxgran.dynamics.interruption import PATIENCE, block_until_done, engines_stopped
 from jaxgran.environment import usable_threads
 from jaxgran.model.checks import InputError, is_traced
 from jaxgran.model.flow import ShearFlow
@@ -162,11 +162,11 @@ def run_batch(
       threads: most threads on a processor.
     """
     if in_lockstep():
-        return waited(_together(function, static, shared, batch))
+        return block_until_done(_together(function, static, shared, batch))
     replicas = list(replicas_of(batch))
 
     def run(k: int, _: Send = lambda _: None) -> Any:
-        return jax.tree.map(np.asarray, waited(function(*replicas[k], *shared, *static)))
+        return jax.tree.map(np.asarray, block_until_done(function(*replicas[k], *shared, *static)))
 
     order = range(len(replicas)) if costs is None else np.argsort(-costs, kind="stable").tolist()
     if min(threads, len(replicas)) == 1:

@@ -13,8 +13,6 @@ from functools import cache, partial
 from typing import Any, ClassVar
 
 import jax
-import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Int
 
 from jaxgran.contact.projected_methods import (
@@ -26,6 +24,7 @@ from jaxgran.contact.projected_methods import (
 )
 from jaxgran.dynamics.batching import with_forward_derivative, with_own_batching
 from jaxgran.dynamics.jax_engine import advance_by_jax
+from jaxgran.dynamics.numba_engine.observed import advance_by_numba
 from jaxgran.dynamics.observer import Observe
 from jaxgran.dynamics.tally import Tally
 from jaxgran.environment import default_device, precision
@@ -147,28 +146,9 @@ class Numba:
         """As ``Jax.advance``; the list of near pairs outlives a block, where nothing is
         observed.
         """
-        run = partial(_advance_by_numba, observe=observe)
+        run = partial(advance_by_numba, observe=observe)
         differentiable = partial(advance_by_jax, observe=observe)
         return with_forward_derivative(run, differentiable)(flow, solver, state, steps)
-
-
-def _advance_by_numba(
-    flow: ShearFlow,
-    solver: ProjectedMethod,
-    state: State,
-    steps: Int[Array, "*blocks"],
-    observe: Observe | None,
-) -> tuple[State, Tally]:
-    from jaxgran.dynamics.numba_engine.call import advance_by_numba
-    from jaxgran.dynamics.numba_engine.observed import observe_by_numba
-
-    if observe is None:
-        return advance_by_numba(flow, solver, state, steps)
-
-    def of_block(state: State, steps: Array) -> tuple[State, Tally]:
-        return observe_by_numba(observe, flow, solver, state, steps)
-
-    return lax.scan(of_block, state, steps) if jnp.ndim(steps) else of_block(state, steps)
 
 
 Engine = Jax | Numba

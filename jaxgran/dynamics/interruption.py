@@ -13,7 +13,7 @@ PATIENCE = 0.5  # seconds; longest wait for the end of what was interrupted
 T = TypeVar("T")
 
 
-def waited(results: T) -> T:
+def block_until_done(results: T) -> T:
     """The results when they are computed.
 
     A KeyboardInterrupt, as by Ctrl-C, stops every run of the numba engine in this process within

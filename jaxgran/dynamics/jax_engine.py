@@ -134,8 +134,8 @@ def _after_events(constants: Constants, begin: Carry, events: int) -> Carry:
     """
 
     def visit(now: Carry, _: None) -> tuple[Carry, None]:
-        going = any_replica(unfinished(constants, now))
-        return lax.cond(going, partial(_next, constants), lambda now: now, now), None
+        active = any_replica(unfinished(constants, now))
+        return lax.cond(active, partial(_next, constants), lambda now: now, now), None
 
     return lax.scan(jax.checkpoint(visit), begin, length=events)[0]
 

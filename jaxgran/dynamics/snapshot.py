@@ -1,8 +1,8 @@
 """A snapshot: a flow at one instant, with the contact forces at that instant.
 
 A time step begins with the state of a snapshot. Its contacts change the velocities at once
-(``collided``). The grains then fly freely for dt (``flown``). A contact force is the impulse over
-dt.
+(``collided``). The grains then fly freely for dt (``free_flight``). A contact force is the impulse
+over dt.
 """
 
 from dataclasses import dataclass, replace
@@ -80,7 +80,7 @@ def collided(snapshot: Snapshot) -> State:
     return replace(state, velocities=state.velocities + momenta / state.grains.masses[:, None])
 
 
-def flown(state: State, shear_rate: float | Array, time: float | Array) -> State:
+def free_flight(state: State, shear_rate: float | Array, time: float | Array) -> State:
     """The state after free flight: grains keep their velocity in the laboratory frame, and the cell
     is sheared.
     """

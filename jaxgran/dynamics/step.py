@@ -170,15 +170,15 @@ def event(constants: Constants, now: Carry) -> Carry:
     A flight ends earlier where the near list does; a new list then comes before the contacts.
     """
     flow, near = constants.flow, now.lists.near
-    going = unfinished(constants, now)
+    active = unfinished(constants, now)
     jump = _steps_to_fly(constants, now)
-    flown = fly(constants, now, jump)
+    after_flight = fly(constants, now, jump)
 
-    spare = flown.slack - now.closing_speed * flow.activation * flow.timestep
+    spare = after_flight.slack - now.closing_speed * flow.activation * flow.timestep
     rounding = 16 * jnp.finfo(spare.dtype).eps * near.skin  # of the slack, summed over flights
     expired = spare < -rounding
-    needs_solve = going & (flown.step < constants.steps) & ~(expired & (jump > 0))
-    collided = collide(constants, flown, needs_solve)
+    needs_solve = active & (after_flight.step < constants.steps) & ~(expired & (jump > 0))
+    collided = collide(constants, after_flight, needs_solve)
 
     missing = near.overflow | (expired & needs_solve)
     listed = jnp.where(missing, Status.capacity, Status.ok)
@@ -186,7 +186,7 @@ def event(constants: Constants, now: Carry) -> Carry:
     sums = collided.sums._replace(status=jnp.maximum(collided.sums.status, status))
     speed = closing_speed_bound(flow, constants.grains, collided.velocities, near.skin)
     after = collided._replace(closing_speed=speed, solved=needs_solve, sums=sums)
-    return where_active(going, _with_readings(constants, after), now)
+    return where_active(active, _with_readings(constants, after), now)
 
 
 def _steps_to_fly(constants: Constants, now: Carry) -> Int[Array, ""]:

@@ -14,7 +14,7 @@ from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.advance import advance_replica, engine_of
 from jaxgran.dynamics.batch import Arguments, checked_batch, shear_batch
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics, select_engine
-from jaxgran.dynamics.interruption import waited
+from jaxgran.dynamics.interruption import block_until_done
 from jaxgran.dynamics.observer import Observe
 from jaxgran.dynamics.tally import Tally
 from jaxgran.environment import usable_threads
@@ -130,7 +130,7 @@ def sample(
     if callback is None:
         if batch is None:
             flow, strain = in_dtype((flow_of_state(flow), strain), state.side.dtype)
-            return waited(_sample(flow, state, strain, numerics, blocks, observe))
+            return block_until_done(_sample(flow, state, strain, numerics, blocks, observe))
         flows, states, strains = batch
         flows, strains = in_dtype((flow_of_state(flows), strains), states.side.dtype)
         return shear_batch(_sample, numerics, (flows, states, strains), (blocks, observe))

@@ -9,29 +9,17 @@ from jaxtyping import Array, Int
 
 from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.jax_engine import ended
-from jaxgran.dynamics.numba_engine import layout
+from jaxgran.dynamics.numba_engine import ffi, layout
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State, kinetic_energy, status_at_start
 
 
-def register_numba() -> None:
-    """Register the numba engine with XLA; it is compiled at its first use on a machine."""
-    from jaxgran.dynamics.numba_engine import ffi
-
-    ffi.register()
-
-
-def advance_by_numba(
-    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Int[Array, "*blocks"]
+def advance_unobserved(
+    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Int[Array, " blocks"]
 ) -> tuple[State, Tally]:
-    """Advance one replica by a number of steps, or by one block of steps after another with a tally
-    (blocks,) for each.
-    """
-    if jnp.ndim(steps) == 0:
-        end, tally = advance_by_numba(flow, solver, state, jnp.asarray(steps)[None])
-        return end, jax.tree.map(lambda x: x[0], tally)
+    """Advance one replica by one block of steps after another, with a tally (blocks,) for each."""
     call = call_numba(flow, solver, state, steps, first_row(flow, state))
     rows = call.blocks
     energy = kinetic_energy(state.grains, state.velocities)
@@ -100,9 +88,7 @@ def call_numba(
       room: number of records, static, for one block; 0 records nothing. With records the call ends
         unfinished where its list of near pairs ends, or the room.
     """
-    from jaxgran.dynamics.numba_engine.ffi import TARGET
-
-    register_numba()
+    ffi.register()
     dtype, grains = state.positions.dtype, state.grains
     inputs = layout.Inputs(
         side=state.side,
@@ -132,5 +118,5 @@ def call_numba(
     kinds = {x.dtype.name for x in operands}
     if kinds != {"float64"}:  # the engine reads doubles whatever it is given
         raise InputError(f"the engine numba must be given float64 only, not {sorted(kinds)}.")
-    call = jax.ffi.ffi_call(TARGET, results, vmap_method="broadcast_all")
+    call = jax.ffi.ffi_call(ffi.TARGET, results, vmap_method="broadcast_all")
     return NumbaCall(*call(*operands))

@@ -1,12 +1,15 @@
-"""What a user's function observes while the numba engine advances a flow, from its records."""
+"""Advances one replica by the numba engine, and sums what a user's function observes, from the
+records of the engine.
+"""
 
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.network import MOST_CONTACTS, Contacts
@@ -14,6 +17,7 @@ from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.numba_engine import layout
 from jaxgran.dynamics.numba_engine.call import (
     NumbaCall,
+    advance_unobserved,
     call_numba,
     ended_by_numba,
     first_row,
@@ -25,7 +29,7 @@ from jaxgran.dynamics.observer import (
     observe_at,
     without_contacts,
 )
-from jaxgran.dynamics.snapshot import flown
+from jaxgran.dynamics.snapshot import free_flight
 from jaxgran.dynamics.tally import Tally, place_of
 from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow
@@ -55,7 +59,26 @@ class _Progress(NamedTuple):
     user_sums: Any
 
 
-def observe_by_numba(
+def advance_by_numba(
+    flow: ShearFlow,
+    solver: ProjectedMethod,
+    state: State,
+    steps: Int[Array, "*blocks"],
+    observe: Observe | None = None,
+) -> tuple[State, Tally]:
+    """Advance one replica by a number of steps, or by one block of steps after another with a tally
+    (blocks,) for each; with the sums of what a function observes.
+    """
+    if observe is not None:
+        run = partial(_advance_observed, observe, flow, solver)
+        return lax.scan(run, state, steps) if jnp.ndim(steps) else run(state, steps)
+    if jnp.ndim(steps):
+        return advance_unobserved(flow, solver, state, steps)
+    end, tally = advance_unobserved(flow, solver, state, steps[None])
+    return end, jax.tree.map(lambda x: x[0], tally)
+
+
+def _advance_observed(
     observe: Observe, flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
 ) -> tuple[State, Tally]:
     """Advance one replica, and sum over all time steps what a function finds in them.
@@ -63,7 +86,7 @@ def observe_by_numba(
     The engine does not call the function. It records the steps that it visits until its list of
     near pairs ends; then JAX applies the function to the records, and the next call goes on from
     there. So only the function is compiled, not an engine. The trajectory is that of
-    ``advance_by_numba`` to the bit, but for rounding where the steps of a list outnumber the
+    ``advance_unobserved`` to the bit, but for rounding where the steps of a list outnumber the
     records, or in flows so large that the engine puts its grains in order.
     """
     dtype, room = state.positions.dtype, records_of_call(flow.grains)
@@ -121,7 +144,7 @@ def _with_records(
         # The step whose contacts have acted, in this record or an earlier one, is no step of the
         # flight.
         flight, solved = until - record[layout.RECORD_STEP], record[layout.RECORD_SOLVED]
-        middle = flown(after, shear_rate, (flight + solved) / 2 * timestep)
+        middle = free_flight(after, shear_rate, (flight + solved) / 2 * timestep)
         weight = jnp.maximum(flight - solved, 0)
         return added(sums, without_contacts(observe_at(observe, flow, middle), dtype), weight)
 
