@@ -18,7 +18,7 @@ from scipy.integrate import quad
 from jaxgran.analysis import fields as fields_module
 from jaxgran.analysis.fields import Fields, fields_at, grid
 from jaxgran.contact.network import Contacts
-from jaxgran.dynamics.snapshot import Snapshot, free_flight, collided
+from jaxgran.dynamics.snapshot import Snapshot, collided, free_flight
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.model.cell import displacement, wrap
 from jaxgran.model.flow import ShearFlow

@@ -13,7 +13,7 @@ from oracles import nearest_image
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from jaxgran.dynamics.snapshot import free_flight, collided
+from jaxgran.dynamics.snapshot import collided, free_flight
 from jaxgran.dynamics.snapshots import snapshot, snapshot_series
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
