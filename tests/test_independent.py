@@ -254,7 +254,7 @@ def symmetric(tensor: np.ndarray) -> np.ndarray:
 
 
 FLOWS = [(0.9, 0.4), (0.9, 0.6), (0.7, 0.4), (0.7, 0.6), (0.5, 0.5), (0.8, 0.7)]
-COUNT, STRAIN, BLOCKS = 128, 1000.0, 20
+COUNT, STRAIN, BLOCKS = 128, 2000.0, 20
 
 
 @pytest.mark.parametrize(("restitution", "packing_fraction"), FLOWS)

@@ -145,9 +145,7 @@ def test_errors_of_a_batch_are_those_of_each_replica_which_an_index_takes() -> N
     np.testing.assert_array_equal(both[1:].pressure, both.pressure[1:])
     with pytest.raises(IndexError):
         both[2]
-    with pytest.raises(
-        InputError, match=r"^an index takes one of a batch, and this is one Sample, not a batch"
-    ):
+    with pytest.raises(InputError, match=r"^this is one Sample, not a batch, and has no index"):
         both[0][0]
 
 
