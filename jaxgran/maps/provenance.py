@@ -2,16 +2,14 @@
 random numbers, and a hash of the sources.
 """
 
-import hashlib
 import os
 import platform
 from collections.abc import Mapping
-from functools import cache
-from pathlib import Path
 
 import jax
 
 from jaxgran import environment
+from jaxgran.cache.persistent_jit import sources_digest
 
 _PACKAGES = ("jaxgran", "jax", "jaxlib", "jax-md", "numba", "numpy", "xarray")
 DECIDING = ("jaxgran", "jax", "jaxlib", "numba", "numpy")
@@ -34,15 +32,6 @@ def made_with() -> dict[str, str]:
             for name, number in environment.versions(_PACKAGES).items()
         },
     }
-
-
-@cache
-def sources_digest() -> str:
-    """A hash of the sources of this package."""
-    digest, folder = hashlib.sha256(), Path(__file__).parents[1]
-    for path in sorted(folder.rglob("*.py")):
-        digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def random_bits() -> str:

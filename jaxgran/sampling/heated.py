@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.dynamics.batch import run_batch, stack
 from jaxgran.model.checks import InputError, is_traced, key_shape, require, require_key
 from jaxgran.model.flow import ShearFlow, flow_of_replica
@@ -99,7 +100,7 @@ def replicas_of_keys(
     )
 
 
-@jax.jit
+@persistent_jit
 def heat_replica(
     flow: ShearFlow, key: Array, temperature: Array, grains: Grains | None
 ) -> tuple[State, Bool[Array, ""]]:

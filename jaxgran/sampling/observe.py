@@ -5,6 +5,7 @@ digest.
 import hashlib
 import re
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -14,10 +15,12 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.contact.network import MOST_CONTACTS
 from jaxgran.dynamics.advance import advance_replica
 from jaxgran.dynamics.batch import predicted_cost, run_batch
 from jaxgran.dynamics.engine import Numerics
+from jaxgran.dynamics.numba_engine import ffi
 from jaxgran.dynamics.observer import Observe, nothing_observed, observe_at, without_contacts
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow
@@ -66,9 +69,10 @@ def advance_batch(
     """
     strain = np.asarray(steps) * np.asarray(flow.timestep)
     costs = predicted_cost(flow) * strain if threads > 1 else None
-    return run_batch(
-        _advance_replica, (flow, state, steps), (numerics,), (observe,), costs, threads
-    )
+    run = partial(run_batch, batch=(flow, state, steps), costs=costs, threads=threads)
+    if observe is None:
+        return run(_advance_replica, shared=(numerics,))
+    return run(_observe_replica, shared=(numerics,), static=(observe,))
 
 
 def reporting(advance: ObserveBatch, report: Report) -> ObserveBatch:
@@ -88,7 +92,8 @@ def reporting(advance: ObserveBatch, report: Report) -> ObserveBatch:
     return advance_and_report
 
 
-_advance_replica = jax.jit(advance_replica, static_argnames="observe")
+_advance_replica = persistent_jit(advance_replica, ffi.register)
+_observe_replica = jax.jit(advance_replica, static_argnames="observe")
 
 
 def observed_shapes(observe: Observe, flow: ShearFlow) -> Any:

@@ -8,6 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
@@ -52,7 +53,7 @@ def predicted(flow: ShearFlow, grains: Grains | None = None) -> SteadyShear:
     return kinetic_theory(*numbers, flow.polydispersity, grains)
 
 
-@jax.jit
+@persistent_jit
 def _moments(numbers: Float[Array, "flows 4"], *classes: Float[Array, "flows classes"]) -> Any:
     if not classes:
         return jax.vmap(gaussian_moments)(*numbers.T)

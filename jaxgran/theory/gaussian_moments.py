@@ -166,6 +166,21 @@ def _newton(function, start):
 
 
 def _dense_solve(linear, side):
-    """Solve ``linear(x) = side`` for a dozen unknowns."""
-    matrix = jax.jacobian(linear)(side).reshape(side.size, side.size)
-    return jnp.linalg.solve(matrix, side.reshape(-1)).reshape(side.shape)
+    """Solve ``linear(x) = side`` for a dozen unknowns, by the inverse of the matrix.
+
+    It is found by Gauss-Jordan elimination with partial pivoting: ``persistent_jit`` does not keep
+    programs that call LAPACK, as ``jnp.linalg`` does.
+    """
+    size = side.size
+    places = jnp.arange(size)
+
+    def eliminate(k: Array, rows: Array) -> Array:
+        best = jnp.argmax(jnp.where(places < k, -1, jnp.abs(rows[:, k])))
+        pivot = (rows[best] / rows[best, k])[None, :]
+        swapped = rows.at[best].set(rows[k])
+        return jnp.where((places == k)[:, None], pivot, swapped - swapped[:, k, None] * pivot)
+
+    matrix = jax.jacobian(linear)(side).reshape(size, size)
+    start = jnp.concatenate([matrix, jnp.eye(size, dtype=side.dtype)], axis=1)
+    inverse = jax.lax.fori_loop(0, size, eliminate, start)[:, size:]
+    return jnp.sum(inverse * side.reshape(1, size), axis=1).reshape(side.shape)
