@@ -378,7 +378,9 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "`strain` and `error` exclude each other": lambda: map_of(strain=5.0, error=0.02),
     "snapshots must be True or False": lambda: make_map("snapshots", 1),
     "jg.Jax(), jg.Numba() or None": lambda: make_map("engine", "jax"),
-    "with the solver jacobi, not numba": lambda: map_of(engine=jg.Numba(), solver=jg.Jacobi()),
+    "engine numba cannot run with the solver jacobi": lambda: map_of(
+        engine=jg.Numba(), solver=jg.Jacobi()
+    ),
     "part must be K/N": lambda: make_map("part", "4/3"),
     "length divides the number of grains, 32": lambda: map_of(diameters=[1.0, 1.4, 2.0]),
     "the largest diameter": lambda: map_of(diameters=LAST),

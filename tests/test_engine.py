@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from flows import GRAINS, assert_same_bits
 from synthetic import refused
+from test_batching import compiled
 
 import jaxgran as jg
 from jaxgran.contact.projected_methods import solver_name
@@ -81,11 +82,11 @@ def test_single_precision_that_was_not_asked_for_is_one_warning(flowing) -> None
 IMPOSSIBLE = {
     "another solver": (
         lambda state: jg.advance(of(), state, STEPS, engine=jg.Numba(), solver=jg.Jacobi()),
-        "with the solver jacobi, not numba",
+        "with the solver jacobi: take jg.Jax()",
     ),
     "single precision": (
         lambda state: jg.advance(of(), single(state), STEPS, engine=jg.Numba()),
-        'in float32 (jax.config.update("jax_enable_x64", True) computes in float64), not numba',
+        'in float32 (jax.config.update("jax_enable_x64", True) computes in float64): take jg.Jax()',
     ),
 }
 
@@ -94,7 +95,7 @@ IMPOSSIBLE = {
 def test_an_engine_that_cannot_do_what_is_asked_says_so(case: str, flowing) -> None:
     call, words = IMPOSSIBLE[case]
     sentence = refusal(lambda: call(flowing(0.7)))
-    assert sentence.startswith(f"engine must be jax or chosen automatically {words}")
+    assert sentence.startswith(f"engine numba cannot run {words}")
 
 
 # What runs
@@ -120,8 +121,8 @@ def test_a_number_of_steps_may_be_one_of_python(engine, flowing) -> None:
 @pytest.mark.parametrize("numerics", [{"engine": jg.Jax()}, {"solver": jg.Jacobi()}])
 def test_jax_by_name_and_for_another_solver_is_the_plain_advance(numerics, flowing) -> None:
     solver = numerics.get("solver", jg.BarzilaiBorwein())
-    chosen = jax.jit(partial(jg.advance, **numerics))(of(), flowing(0.7), STEPS)
-    assert_same_bits(chosen, jax.jit(advance_by_jax)(of(), solver, flowing(0.7), STEPS))
+    chosen = compiled(partial(jg.advance, **numerics))(of(), flowing(0.7), STEPS)
+    assert_same_bits(chosen, compiled(advance_by_jax)(of(), solver, flowing(0.7), STEPS))
 
 
 @pytest.mark.parametrize(

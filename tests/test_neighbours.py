@@ -34,9 +34,9 @@ def mapped_search(positions, side, tilt, cutoff):
 @jax.jit
 def batched_search(positions, side, tilt, cutoff):
     capacity = PAIRS_PER_GRAIN * positions.shape[1]
-    return jax.vmap(
-        lambda *replica: cell_list_pairs(*replica, capacity), axis_name="jaxgran_replica"
-    )(positions, side, tilt, cutoff)
+    return jax.vmap(lambda *replica: cell_list_pairs(*replica, capacity))(
+        positions, side, tilt, cutoff
+    )
 
 
 def flow_cell(count, packing_fraction, polydispersity=0.26):

@@ -163,8 +163,11 @@ def test_what_is_observed_may_depend_on_what_is_differentiated(flowing) -> None:
         )
         return measured.observed_sums
 
-    primals, tangents = jax.eval_shape(lambda scale: jax.jvp(found, (scale,), (1.0,)), 2.0)
-    assert primals.shape == tangents.shape == (BLOCKS,)
+    primals, tangents = jax.jit(lambda scale: jax.jvp(found, (scale,), (1.0,)))(2.0)
+    assert primals.shape == (BLOCKS,)
+    np.testing.assert_allclose(primals, 2 * tangents, rtol=1e-12)
+    each = jax.jit(jax.vmap(found))(jnp.asarray([1.0, 2.0]))
+    np.testing.assert_allclose(each, [tangents, primals], rtol=1e-9)
 
 
 def test_callback_is_told_of_every_block_and_may_end_the_sample(flowing) -> None:

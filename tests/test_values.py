@@ -72,6 +72,7 @@ def test_a_value_with_an_axis_is_indexed_sliced_counted_and_iterated(name: str) 
     each = list(value)
     assert len(each) == count and value[-1] == each[-1] == value[count - 1] != value[0]
     assert len(value[1:]) == count - 1 and value[1:][0] == value[1] == value[[1, 0]][0]
+    assert jax.tree.map(jnp.asarray, value)[[1, 0]] == value[[1, 0]]
     with pytest.raises(IndexError):
         value[count]
     with pytest.raises(InputError, match=f"this is one {name}, not a"):

@@ -1,4 +1,5 @@
-"""The cache of compiled programs on disk: where it is, and that JAX uses it.
+"""The cache of compiled programs on disk.
 
-It imports `environment` only.
+It imports `environment` and `files` only. `folder` locates the cache; `persistent_jit` keeps what
+every command computes first.
 """

@@ -1,8 +1,8 @@
 """``jit`` with compiled programs on disk, for what every command computes first.
 
-JAX's cache of compiled programs is found by a program that has been traced and lowered, which takes
-longer than to load it: with that cache alone a second ``jaxgran run`` takes 1.8 times as long. Here
-the key needs no tracing: sources of this package, versions, flags, and shapes of the arguments.
+To look a program up in its own cache, JAX must first trace and lower it, which takes longer than
+loading it: with that cache alone a second ``jaxgran run`` takes 1.8 times as long. Here the key
+needs no tracing: sources of this package, versions, flags, and shapes of the arguments.
 """
 
 import hashlib
@@ -38,8 +38,9 @@ def persistent_jit(function: Callable, register: Callable[[], None] = lambda: No
     """``jax.jit`` of a function, with programs for a processor kept on disk after ``use_cache``.
 
     Args:
-      function: a function of pytrees of arrays, without static arguments.
-      register: called before a program is loaded, as it may call the numba engine.
+      function: a function of pytrees of arrays, without static arguments. JAX's flags are read at
+        the first call with arguments of given shapes.
+      register: called before a program is loaded that calls the numba engine.
     """
     jitted = jax.jit(function)
     programs: dict[Any, Callable] = {}
@@ -105,25 +106,29 @@ def _load(path: Path, register: Callable[[], None]) -> Callable | None:
         stored = path.read_bytes()
         content = stored[32:]
         if hashlib.sha256(content).digest() == stored[:32]:
-            register()
-            return deserialize_and_load(*pickle.loads(content))
+            calls, *parts = pickle.loads(content)
+            if calls:
+                register()
+            return deserialize_and_load(*parts)
     return None
 
 
 def _compile(lowered: Any, path: Path) -> Callable:
     """Compile, and keep the program unless it calls another library."""
-    if not set(_CUSTOM_CALL.findall(lowered.as_text())) <= _KEPT_CALLS:
+    calls = {*_CUSTOM_CALL.findall(lowered.as_text())}
+    if not calls <= _KEPT_CALLS:
         return lowered.compile()
     with _without_writing_to_jax_cache() as hits:
         program = lowered.compile()
     if hits:  # a program from JAX's cache cannot be serialised again: XLA omits part of it
         return program
-    content = pickle.dumps(serialize(program))
-    with suppress(OSError), atomic_write(path) as temporary:
-        temporary.write_bytes(hashlib.sha256(content).digest() + content)
-    files = sorted(path.parent.glob("*.program"), key=lambda file: file.stat().st_mtime)
-    for old in files[:-_MOST_PROGRAMS]:
-        old.unlink(missing_ok=True)
+    content = pickle.dumps((bool(calls), *serialize(program)))
+    with suppress(OSError):  # a folder that cannot be written, or another process that writes there
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(hashlib.sha256(content).digest() + content)
+        files = path.parent.glob("[!.]*.program")
+        for old in sorted(files, key=lambda file: file.stat().st_mtime)[:-_MOST_PROGRAMS]:
+            old.unlink(missing_ok=True)
     return program
 
 

@@ -42,9 +42,9 @@ def advance(
     Without an ``engine``, ``Numba`` is taken on a processor in double precision, if the solver is a
     ``BarzilaiBorwein``; otherwise ``Jax``. Both engines solve the same steps to the same tolerance,
     and differ by rounding and within the tolerance only; on a processor ``Numba`` is several times
-    faster. Under ``vmap``, replicas take a processor in turn by ``Jax``, on all cores by ``Numba``,
-    and an accelerator in lockstep, with the same bits as alone. This function does not compile
-    itself: call it within ``jax.jit``.
+    faster. Under ``vmap``, ``Jax`` runs replicas one after another on a processor and in lockstep
+    on an accelerator, and ``Numba`` on all cores, with the same bits as alone. This function does
+    not compile itself: call it within ``jax.jit``.
 
     Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) need no further argument; reverse-mode
     derivatives (``jax.grad``, ``jax.vjp``) need ``engine=Jax(events=...)``. Both are derivatives of
@@ -140,7 +140,8 @@ def count_events(
 
     They are those of these numbers only: with another restitution, as in an optimisation, an
     advance may visit more. Leave room, such as half as many again; ``2 * steps + 1`` are always
-    enough. Arguments and errors are those of ``advance``.
+    enough. Arguments and errors are those of ``advance``, for one
+    flow and one number of steps.
     """
     require_advance(flow, state, steps)
     require_solver(solver)

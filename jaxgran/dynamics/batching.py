@@ -36,16 +36,17 @@ def with_own_batching(function: Callable[..., T]) -> Callable[..., T]:
     def call(*arguments: Any) -> T:
         traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
 
-        @custom_vmap
-        def in_turn(constants: list[jax.Array], *arguments: Any) -> T:
+        def with_constants(constants: list[jax.Array], *arguments: Any) -> T:
             of_leaves = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, constants))
             return jax.tree.structure(shapes).unflatten(of_leaves(*jax.tree.leaves(arguments)))
+
+        in_turn = custom_vmap(with_constants)
 
         @in_turn.def_vmap
         def _(size: int, is_batched: list, *arguments: Any) -> tuple[T, Any]:
             if in_lockstep():
-                axes = jax.tree.map(lambda mine: 0 if mine else None, tuple(is_batched[1:]))
-                result = jax.vmap(function, axes)(*arguments[1:])
+                axes = jax.tree.map(lambda mine: 0 if mine else None, tuple(is_batched))
+                result = jax.vmap(with_constants, axes)(*arguments)
             else:
                 result = _map(in_turn, arguments, is_batched)
             return result, jax.tree.map(lambda _: True, result)
@@ -71,8 +72,8 @@ def _map(function: Callable[..., T], arguments: tuple, is_batched: list) -> T:
 def with_forward_derivative(
     engine: Callable[..., T], differentiable: Callable[..., T]
 ) -> Callable[..., T]:
-    """An engine that JAX differentiates in forward mode as another function of the same arguments;
-    the values beside a derivative are also those of that function.
+    """``engine``, whose derivative in forward mode is that of ``differentiable``, a function of the
+    same arguments; ``jax.jvp`` also returns the values of the latter.
     """
     differentiated = jax.custom_jvp(engine)
 

@@ -2,9 +2,9 @@
 solver.
 
 Both engines solve the same steps to the same tolerance, and differ in speed and rounding. An engine
-is an object with two methods: ``refuses`` says what it cannot do, and ``advance`` advances one
-replica. Where none is given, ``Numba`` is taken if it can do what is asked for, and otherwise
-``Jax``.
+is an object with a name: ``refuses`` says what it cannot do, ``solver_in_use`` which method solves
+its contacts, and ``advance`` advances one replica. Where none is given, ``Numba`` is taken if it
+can do what is asked for, and otherwise ``Jax``.
 """
 
 import warnings
@@ -25,7 +25,7 @@ from jaxgran.contact.projected_methods import (
 from jaxgran.dynamics.batching import with_forward_derivative, with_own_batching
 from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.dynamics.numba_engine.observed import advance_by_numba
-from jaxgran.dynamics.observer import Observe
+from jaxgran.dynamics.observer import Observe, uses_traced_values
 from jaxgran.dynamics.tally import Tally
 from jaxgran.environment import default_device, precision
 from jaxgran.model.checks import InputError, require_flag, require_whole, short_repr
@@ -40,7 +40,8 @@ _ENABLE_X64 = 'jax.config.update("jax_enable_x64", True)'
 class Jax:
     """The engine in JAX: every backend, precision and solver, and derivatives.
 
-    The replicas of a batch advance one by one on a processor, in lockstep on an accelerator.
+    The replicas of a batch advance one by one on a processor, in lockstep on an accelerator and
+    with ``events``.
     Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) need no argument. Reverse-mode
     derivatives (``jax.grad``, ``jax.vjp``) need the number of ``events``. Reverse mode stores the
     state and the lists of every event, about 0.6 kB a grain, and computes contacts and impulses
@@ -52,7 +53,7 @@ class Jax:
         too few, the status is ``capacity``, and numbers and derivatives are NaN. None visits as
         many as needed.
       moving_contacts: whether derivatives include the shift of the contacts in time, see
-        ``dynamics.jax_engine``. Values do not change.
+        ``dynamics.jax_engine``. The trajectory does not change.
       free_flight: True jumps over steps without an approaching contact; False visits every step.
         The trajectory is the same.
 
@@ -98,7 +99,9 @@ class Jax:
             moving_contacts=self.moving_contacts,
             free_flight=self.free_flight,
         )
-        if self.events is None:
+        # The rules know the arguments only, and reverse mode knows none.
+        closes = observe is not None and uses_traced_values(observe, flow, state)
+        if self.events is None and not closes:
             run = with_forward_derivative(with_own_batching(run), run)
         return run(flow, solver, state, steps)
 
@@ -216,7 +219,9 @@ def select_engine(numerics: Numerics, state: State | None = None) -> Engine:
     if not wrong:
         return engine
     if numerics.engine is not None:
-        raise InputError(f"engine must be jax or chosen automatically {wrong}, not {engine.name}.")
+        raise InputError(
+            f"engine {engine.name} cannot run {wrong}: take jg.Jax(), or leave the engine out."
+        )
     if (
         state is not None
         and precision() == "float32"

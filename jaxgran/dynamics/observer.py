@@ -57,8 +57,8 @@ def observe_at(observe: Observe, flow: ShearFlow, state: State) -> ObserveNow:
             return observe(snapshot)
         except _NEEDS_VALUES as error:
             raise InputError(
-                "observe must compute with jax.numpy, since JAX traces its snapshot, and "
-                f"{_line_of(observe, error)} needs the values: jnp.sum and jnp.where take the "
+                "observe must compute with jax.numpy, because JAX traces its snapshot, and "
+                f"{_line_of(observe, error)} needs concrete values: jnp.sum and jnp.where take the "
                 "place of functions of NumPy, float() and if."
             ) from None
 
@@ -109,8 +109,8 @@ def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> O
     few, many = returned(1), returned(slots)
     if few != many:
         raise InputError(
-            "observe must return sums over the contacts: a step has slots for more or fewer of "
-            "them."
+            "observe must return arrays whose shapes do not depend on the number of slots for "
+            "contacts, which varies: sum over the contacts."
         )
     return Observed(jax.tree.map(lambda x: jnp.zeros(x.shape, dtype), few), jnp.zeros((), dtype))
 

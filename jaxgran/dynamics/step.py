@@ -67,7 +67,7 @@ _SINGLE_SLOTS = 4  # for one contact: in one slot XLA would compute the terms on
 
 
 class Constants(NamedTuple):
-    """What does not change in an advance; the last three are static."""
+    """What does not change in an advance; the last four are static."""
 
     flow: ShearFlow
     grains: Grains

@@ -34,8 +34,8 @@ def _(size: int, batched: list[bool], predicate: jax.Array) -> tuple[jax.Array, 
 
 @custom_vmap
 def _takes_part(active: jax.Array) -> jax.Array:
-    """Whether a replica takes part in an iteration: outside a batch always, as its loop ends with
-    it.
+    """Whether a replica takes part in an iteration: always outside a batch, where a loop ends with
+    its only replica.
     """
     return jnp.ones_like(active)
 

@@ -117,8 +117,9 @@ class Indexable(Value):
         if not self._axes:
             raise InputError(f"this is one {type(self).__name__}, not a batch, and has no index.")
         if not is_traced(place):
-            np.broadcast_to(0, self._axes)[place]  # JAX would take the last for one beyond it
-        return jax.tree.map(lambda leaf: leaf[place], self)
+            np.broadcast_to(0, self._axes)[place]  # JAX clamps an index that is out of range
+        index = np.asarray(place) if isinstance(place, list) else place  # JAX refuses lists
+        return jax.tree.map(lambda leaf: leaf[index], self)
 
     def __len__(self) -> int:
         """How many a batch or series holds; TypeError for a single value."""

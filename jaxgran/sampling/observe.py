@@ -67,7 +67,7 @@ def advance_batch(
     Raises:
       InputError: the engine cannot do this.
     """
-    strain = np.asarray(steps) * np.asarray(flow.timestep)
+    strain = np.asarray(steps) * np.asarray(flow.timestep) * np.asarray(flow.shear_rate)
     costs = predicted_cost(flow) * strain if threads > 1 else None
     run = partial(run_batch, batch=(flow, state, steps), costs=costs, threads=threads)
     if observe is None:

@@ -11,7 +11,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -120,9 +120,10 @@ def compiled_handler(folder: Path) -> Any:
         finally:
             config.CACHE_DIR = before
     if not found.cache_hits:
-        versions = sorted(folder.parent.glob("jaxgran-*"), key=lambda path: path.stat().st_mtime)
-        for old in versions[:-MOST_KEPT]:
-            shutil.rmtree(old, ignore_errors=True)
+        with suppress(OSError):  # another process removes them, too
+            folders = [path for path in folder.parent.glob("jaxgran-*") if path.is_dir()]
+            for old in sorted(folders, key=lambda path: path.stat().st_mtime)[:-MOST_KEPT]:
+                shutil.rmtree(old, ignore_errors=True)
     return found
 
 
@@ -131,8 +132,9 @@ def engines_stopped() -> Iterator[None]:
     """Within this block every running call of the numba engine in this process ends, with the
     status ``failed``.
     """
-    shared_words()[STOP] = 1
+    words = shared_words()
+    words[STOP] = 1
     try:
         yield
     finally:
-        shared_words()[STOP] = 0
+        words[STOP] = 0

@@ -184,10 +184,10 @@ def handler(address):
     if address == 0:
         return of_shared
     shared, frame = _words(of_shared, SHARED_WORDS), _words(address, RETS + 1)
-    if _answers_metadata(frame):
-        return 0
     if frame[_SIZE] == _JOB:
         job, last = _words(address, _JOB_WORDS), _JOB_WORDS
+    elif _answers_metadata(frame):
+        return 0
     else:
         job, last = _start_threads(address, frame, shared)
     frame = _words(job[_FRAME], RETS + 1)
