@@ -333,7 +333,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     ),
     "count must be at most": lambda: jg.snapshot_series(flow(), SEEN.state, 1.0, 10**9),
     "strain must be": lambda: jg.snapshot_series(flow(), SEEN.state, 1e-3, 5),
-    "observe must return sums over the contacts": lambda: observing(lambda seen: seen.impulses),
+    "which varies: sum over the contacts": lambda: observing(lambda seen: seen.impulses),
     "observe must return real numbers": lambda: observing(lambda _: 1j),
     "observe must return at least one number, not": lambda: observing(lambda _: {}),
     "restitution must be one first guess": lambda: fitting(flow=make_flow("restitution", 1.0)),
