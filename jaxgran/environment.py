@@ -27,11 +27,13 @@ def commit() -> str:
     return ""
 
 
-def processor() -> str:
-    """The model of the processor, or "unknown"."""
+def processor(*entries: str) -> str:
+    """The model of the processor, or another entry of ``/proc/cpuinfo``, the first of these names;
+    where there is none, the name of the processor, or "unknown".
+    """
     with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
+            if line.startswith(entries or "model name"):
                 return line.split(":", 1)[1].strip()
     return platform.processor() or "unknown"
 

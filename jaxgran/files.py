@@ -7,7 +7,7 @@ leaves either the old file or the new one, never a part of one.
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -97,6 +97,16 @@ def is_locked(path: Path, handle: int | None) -> bool:
         return handle is None or os.path.samestat(os.fstat(handle), path.stat())
     except OSError:
         return False
+
+
+def keep_newest(paths: Iterable[Path], most: int) -> None:
+    """Remove the oldest of files and folders beyond so many; another process may do the same."""
+    with suppress(OSError):
+        for old in sorted(paths, key=lambda path: path.stat().st_mtime)[:-most]:
+            if old.is_dir():
+                shutil.rmtree(old, ignore_errors=True)
+            else:
+                old.unlink(missing_ok=True)
 
 
 def other_version(name: str, stored: object, version: int | str) -> str:

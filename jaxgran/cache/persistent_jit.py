@@ -8,12 +8,10 @@ needs no tracing: sources of this package, versions, flags, and shapes of the ar
 import hashlib
 import os
 import pickle
-import platform
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, wraps
-from importlib.metadata import version
 from pathlib import Path
 from threading import RLock
 from typing import Any
@@ -24,8 +22,8 @@ from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
 from jaxgran.cache.folder import programs_folder
-from jaxgran.environment import default_device
-from jaxgran.files import atomic_write, file_lock
+from jaxgran.environment import default_device, processor, versions
+from jaxgran.files import atomic_write, file_lock, keep_newest
 
 _MOST_PROGRAMS = 64  # of up to 4 MB each
 _CUSTOM_CALL = re.compile(r"stablehlo\.custom_call @(\w+)")
@@ -77,12 +75,9 @@ def sources_digest() -> str:
 @cache
 def _origin() -> str:
     """What every program depends on: sources, versions, processor, XLA's flags."""
-    information = Path("/proc/cpuinfo")
-    lines = information.read_text().splitlines() if information.is_file() else []
-    features = (line for line in lines if line.startswith(("flags", "Features")))
-    versions = [version(name) for name in ("jax", "jaxlib", "numpy")]
-    processor = next(features, platform.processor())
-    return "\n".join([sources_digest(), *versions, processor, os.environ.get("XLA_FLAGS", "")])
+    packages = versions(("jax", "jaxlib", "numpy")).values()
+    flags = os.environ.get("XLA_FLAGS", "")
+    return "\n".join([sources_digest(), *packages, processor("flags", "Features"), flags])
 
 
 def _digest(function: Callable, key: tuple) -> str:
@@ -123,12 +118,9 @@ def _compile(lowered: Any, path: Path) -> Callable:
     if hits:  # a program from JAX's cache cannot be serialised again: XLA omits part of it
         return program
     content = pickle.dumps((bool(calls), *serialize(program)))
-    with suppress(OSError):  # a folder that cannot be written, or another process that writes there
-        with atomic_write(path) as temporary:
-            temporary.write_bytes(hashlib.sha256(content).digest() + content)
-        files = path.parent.glob("[!.]*.program")
-        for old in sorted(files, key=lambda file: file.stat().st_mtime)[:-_MOST_PROGRAMS]:
-            old.unlink(missing_ok=True)
+    with suppress(OSError), atomic_write(path) as temporary:
+        temporary.write_bytes(hashlib.sha256(content).digest() + content)
+    keep_newest(path.parent.glob("[!.]*.program"), _MOST_PROGRAMS)
     return program
 
 

@@ -160,8 +160,10 @@ class SolvedContact(NamedTuple):
 
 def contact_terms(contact: SolvedContact) -> ContactTerms:
     """What one contact adds to the running sums."""
-    nx, ny, distance, overlap, approach, half_change, one_plus_alpha = contact[:7]
-    impulse, binary_impulse, clustered, used, loaded, approaching = contact[7:]
+    nx, ny, distance = contact.nx, contact.ny, contact.distance
+    impulse, binary_impulse, clustered = contact.impulse, contact.binary_impulse, contact.clustered
+    approach, half_change = contact.approach, contact.half_change
+    one_plus_alpha = contact.one_plus_alpha
     xx, xy, yy = nx * nx * distance, nx * ny * distance, ny * ny * distance
     # The impulse is zero where the contact does not approach
     binary_power = -binary_impulse * approach
@@ -179,11 +181,11 @@ def contact_terms(contact: SolvedContact) -> ContactTerms:
         cluster_moment_yy=clustered * yy,
         dissipation=-impulse * (approach + half_change),
         complementarity=impulse * (one_plus_alpha / 2 * approach + half_change),
-        contacts=used,
-        loaded_contacts=loaded,
-        collisions=approaching,
-        overlap=overlap,
-        deep_contacts=where(overlap > DEEP_OVERLAP, used, 0),
+        contacts=contact.used,
+        loaded_contacts=contact.loaded,
+        collisions=contact.approaching,
+        overlap=contact.overlap,
+        deep_contacts=where(contact.overlap > DEEP_OVERLAP, contact.used, 0),
         binary_speed_moment_xx=binary_power * xx,
         binary_speed_moment_xy=binary_power * xy,
         binary_speed_moment_yy=binary_power * yy,

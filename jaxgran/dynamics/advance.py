@@ -87,13 +87,11 @@ def advance(
     numerics = checked_numerics(solver, engine)
     require_function("observe", observe)
     batch = checked_batch(require_advance, flow, state, steps)
-    if batch is None:
-        return advance_replica(flow_of_state(flow), state, steps, numerics, observe)
 
     def of_replica(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
         return advance_replica(flow_of_state(flow), state, steps, numerics, observe)
 
-    return over_replicas(of_replica, numerics, batch)
+    return over_replicas(of_replica, numerics, batch) if batch else of_replica(flow, state, steps)
 
 
 def require_advance(flow: ShearFlow, state: State, steps: Any) -> None:
@@ -111,8 +109,8 @@ def advance_replica(
     observe: Observe | None = None,
 ) -> tuple[State, Tally]:
     """``advance`` for one replica, without checks."""
-    # Copies: JAX refuses batches of NumPy numbers, over which vmap maps, in its custom rules.
     engine = engine_of(flow, numerics, state, observe)
+    # Copies: JAX refuses batches of NumPy numbers, over which vmap maps, in its custom rules.
     flow, solver, state = jax.tree.map(jnp.array, (flow, numerics.solver, state))
     return engine.advance(flow, solver, state, jnp.array(steps, jnp.int32), observe)
 
@@ -140,8 +138,7 @@ def count_events(
 
     They are those of these numbers only: with another restitution, as in an optimisation, an
     advance may visit more. Leave room, such as half as many again; ``2 * steps + 1`` are always
-    enough. Arguments and errors are those of ``advance``, for one
-    flow and one number of steps.
+    enough. Arguments and errors are those of ``advance``, for one flow and one number of steps.
     """
     require_advance(flow, state, steps)
     require_solver(solver)

@@ -42,6 +42,7 @@ class Jax:
 
     The replicas of a batch advance one by one on a processor, in lockstep on an accelerator and
     with ``events``.
+
     Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) need no argument. Reverse-mode
     derivatives (``jax.grad``, ``jax.vjp``) need the number of ``events``. Reverse mode stores the
     state and the lists of every event, about 0.6 kB a grain, and computes contacts and impulses

@@ -123,11 +123,11 @@ def middle_of_flight(user_sums: Observed, steps: Array) -> Float[Array, ""]:
 
 
 def with_flight(user_sums: Observed, observe_now: ObserveNow, steps: Array) -> Observed:
-    """The sums with a flight of so many steps, of whose middle ``observe_now`` is; where the
-    contacts of its first step acted, that step is in already.
+    """The sums with a flight of so many steps, which is observed in its middle; where the contacts
+    of its first step acted, that step is in already.
     """
     dtype = user_sums.step_observed.dtype
-    weight = steps.astype(dtype) - user_sums.step_observed
+    weight = jnp.maximum(steps.astype(dtype) - user_sums.step_observed, 0)
     observables = without_contacts(observe_now, dtype)
     return Observed(
         added(user_sums.sums, observables, weight), jnp.zeros_like(user_sums.step_observed)

@@ -8,10 +8,9 @@ folder cannot be written, every process compiles, with a warning.
 import ctypes
 import hashlib
 import os
-import shutil
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -23,7 +22,7 @@ import jax
 from jaxgran.cache.folder import cache_folder, users_folder, why_unwritable
 from jaxgran.dynamics.numba_engine.layout import HANDLER, SHARED_WORDS, STOP, THREADS
 from jaxgran.environment import usable_threads
-from jaxgran.files import file_lock
+from jaxgran.files import file_lock, keep_newest
 from jaxgran.model.checks import InputError
 
 TARGET = "jaxgran_advance"
@@ -120,10 +119,7 @@ def compiled_handler(folder: Path) -> Any:
         finally:
             config.CACHE_DIR = before
     if not found.cache_hits:
-        with suppress(OSError):  # another process removes them, too
-            folders = [path for path in folder.parent.glob("jaxgran-*") if path.is_dir()]
-            for old in sorted(folders, key=lambda path: path.stat().st_mtime)[:-MOST_KEPT]:
-                shutil.rmtree(old, ignore_errors=True)
+        keep_newest(filter(Path.is_dir, folder.parent.glob("jaxgran-*")), MOST_KEPT)
     return found
 
 

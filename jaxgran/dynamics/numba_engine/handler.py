@@ -20,9 +20,9 @@ is registered, XLA calls it with a metadata extension, and asks for the version 
 for. XLA refuses one that it no longer supports, and then `ffi.register` raises an InputError.
 
 A batch comes whole, with leading axes of replicas in all buffers. Threads of the operating system
-take one replica after another: XLA itself runs at most four calls at a time, and numba's default
-pool of threads cannot be entered by two. The thread that XLA calls is one of them, and no thread
-outlives the call.
+take one replica after another: XLA was seen to run independent calls one by one, and numba's
+default pool of threads cannot be entered by two. The thread that XLA calls is one of them, and no
+thread outlives the call.
 """
 
 # pyright: reportCallIssue=false

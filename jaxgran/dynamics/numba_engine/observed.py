@@ -24,10 +24,12 @@ from jaxgran.dynamics.numba_engine.call import (
 )
 from jaxgran.dynamics.observer import (
     Observe,
-    added,
+    Observed,
+    middle_of_flight,
     nothing_observed,
     observe_at,
-    without_contacts,
+    with_contacts,
+    with_flight,
 )
 from jaxgran.dynamics.snapshot import free_flight
 from jaxgran.dynamics.tally import Tally, place_of
@@ -121,18 +123,19 @@ def _with_records(
         record = records[k]
         before = _recorded_state(record, state)
 
-        def with_contacts(slots: int) -> tuple[Any, Array]:
+        def with_slots(slots: int) -> tuple[Any, Array]:
             contacts, impulses = _recorded_contacts(record, state.grains, slots)
             kicks = grain_impulses(contacts, impulses, flow.grains) / state.grains.masses[:, None]
-            found = observe_at(observe, flow, before)(contacts, impulses)
-            return added(user_sums, found, jnp.ones((), dtype)), kicks
+            so_far = Observed(user_sums, jnp.zeros((), dtype))
+            now = observe_at(observe, flow, before)
+            return with_contacts(so_far, now, contacts, impulses).sums, kicks
 
         size = jnp.sum(
             record[layout.RECORD_CONTACTS] > jnp.asarray([0, *sizes[:-1]], dtype), dtype=jnp.int32
         )
         branches = [
             lambda: (user_sums, jnp.zeros_like(before.velocities)),
-            *(partial(with_contacts, n) for n in sizes),
+            *(partial(with_slots, n) for n in sizes),
         ]
         sums, kicks = lax.switch(size, branches)
         after = State(
@@ -141,12 +144,11 @@ def _with_records(
         until = jnp.where(
             k + 1 < count, records[jnp.minimum(k + 1, len(records) - 1), layout.RECORD_STEP], steps
         )
-        # The step whose contacts have acted, in this record or an earlier one, is no step of the
-        # flight.
-        flight, solved = until - record[layout.RECORD_STEP], record[layout.RECORD_SOLVED]
-        middle = free_flight(after, shear_rate, (flight + solved) / 2 * timestep)
-        weight = jnp.maximum(flight - solved, 0)
-        return added(sums, without_contacts(observe_at(observe, flow, middle), dtype), weight)
+        # The step whose contacts have acted, in this record or an earlier one, is in the sums.
+        so_far = Observed(sums, record[layout.RECORD_SOLVED])
+        flight = until - record[layout.RECORD_STEP]
+        middle = free_flight(after, shear_rate, middle_of_flight(so_far, flight) * timestep)
+        return with_flight(so_far, observe_at(observe, flow, middle), flight).sums
 
     return lax.fori_loop(0, count, with_record, user_sums)
 

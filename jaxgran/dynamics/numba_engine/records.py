@@ -15,13 +15,24 @@ from jaxgran.dynamics.numba_engine.layout import (
     IMPULSE,
     NX,
     NY,
+    RECORD_APPROACH,
     RECORD_CONTACTS,
+    RECORD_CX,
+    RECORD_CY,
+    RECORD_DISTANCE,
     RECORD_HEAD,
+    RECORD_I,
+    RECORD_IMPULSE,
+    RECORD_J,
+    RECORD_NX,
+    RECORD_NY,
     RECORD_OF_CONTACT,
     RECORD_OF_GRAIN,
     RECORD_SOLVED,
     RECORD_STEP,
     RECORD_TILT,
+    RECORD_X,
+    RECORD_Y,
     SECOND,
 )
 
@@ -39,8 +50,8 @@ def record_flight(record, step, solved, tilt, t, shear_rate, grains):
     for g in range(in_state.size):
         at = RECORD_HEAD + RECORD_OF_GRAIN * in_state[g]
         y = motion[g].y + motion[g].vy * t
-        record[at], record[at + 1] = motion[g].x + motion[g].vx * t, y
-        record[at + 2], record[at + 3] = motion[g].vx - shear_rate * y, motion[g].vy
+        record[at + RECORD_X], record[at + RECORD_Y] = motion[g].x + motion[g].vx * t, y
+        record[at + RECORD_CX], record[at + RECORD_CY] = motion[g].vx - shear_rate * y, motion[g].vy
 
 
 @njit
@@ -50,6 +61,9 @@ def record_contacts(record, contacts, one_plus_alpha, grains, network):
     record[RECORD_SOLVED], record[RECORD_CONTACTS] = 1.0, contacts
     for c in range(contacts):
         at = RECORD_HEAD + RECORD_OF_GRAIN * in_state.size + RECORD_OF_CONTACT * c
-        record[at], record[at + 1] = in_state[ends[FIRST, c]], in_state[ends[SECOND, c]]
-        record[at + 2], record[at + 3], record[at + 4] = rows[NX, c], rows[NY, c], rows[APPROACH, c]
-        record[at + 5], record[at + 6] = rows[DISTANCE, c], one_plus_alpha * rows[IMPULSE, c]
+        record[at + RECORD_I] = in_state[ends[FIRST, c]]
+        record[at + RECORD_J] = in_state[ends[SECOND, c]]
+        record[at + RECORD_NX], record[at + RECORD_NY] = rows[NX, c], rows[NY, c]
+        record[at + RECORD_APPROACH] = rows[APPROACH, c]
+        record[at + RECORD_DISTANCE] = rows[DISTANCE, c]
+        record[at + RECORD_IMPULSE] = one_plus_alpha * rows[IMPULSE, c]
