@@ -25,14 +25,14 @@ def variables(group: str) -> str:
     row.
     """
     lines = ["| name (dimensions) | unit | meaning |", "| --- | --- | --- |"]
-    for row in VARIABLES:
-        name = row.path.rpartition("/")[2]
+    for path, row in VARIABLES.items():
+        there, _, name = path.rpartition("/")
         family = (
             "_large_system" in name
             or name.startswith("enskog_factor_")
             or (group == "theory" and name in OBSERVABLES)
         )
-        if row.group == group and not family:
+        if (there or "/") == group and not family:
             dims = f" ({', '.join(f'`{dim}`' for dim in row.dims)})" if row.dims else ""
             lines.append(f"| `{name}`{dims} | {unit_of(row.unit)} | {row.meaning} |")
     return "\n".join(lines)

@@ -34,7 +34,7 @@ from benchmarks.output import RESULTS, Output
 from jaxgran.environment import usable_cores
 from jaxgran.maps.results import write_dataset
 from jaxgran.maps.schema import flattened
-from jaxgran.maps.seeds import NOT_RUN
+from jaxgran.maps.variables import NOT_RUN
 
 PLANE = "reference.nc", "reference_between.nc", "reference_dense.nc", "reference_dissipative.nc"
 KEPT = RESULTS / ".reference_map"  # the maps of single seeds

@@ -30,7 +30,7 @@ import jaxgran as jg
 from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
 from benchmarks.reference_map import PLANE
-from jaxgran.maps.seeds import NOT_RUN
+from jaxgran.maps.variables import NOT_RUN
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.sampling.budget import LARGE_SYSTEM, SIZE_LAWS, SizeLaw
 

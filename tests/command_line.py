@@ -20,6 +20,7 @@ from synthetic import random_replica
 from jaxgran.cli import app, info, merge, outcome, run, terminal
 from jaxgran.maps import results
 from jaxgran.maps.replica import Advance
+from jaxgran.maps.rows import SUMS
 from jaxgran.model.status import Status
 
 POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
@@ -70,14 +71,13 @@ def made_up_replicas(
     an exception.
     """
 
-    def replicas(settings, workers, report, checkpoint, scheduler, record, made) -> Iterator:
+    def replicas(settings, missing, workers, report, *_, **__) -> Iterator:
         rng = np.random.default_rng(0)
-        for key, status in statuses.items():
-            report(Advance([key], [1e-3], [100.0]))
-            replica = random_replica(rng, settings, status, key[0])
-            if checkpoint is not None:
-                checkpoint.add({key: replica})
-            yield key, replica
+        for (point, seed), status in statuses.items():
+            replica = random_replica(rng, settings, status, point, seed)
+            if replica.id in missing:
+                report(Advance([replica.id], [1e-3], [100.0]))
+                yield replica
         if end is not None:
             raise end
 
@@ -94,7 +94,7 @@ def write_few_variables(patch: pytest.MonkeyPatch, *more: str) -> None:
         for name in names
         for end in ("", "_stderr", "_large_system", "_large_system_ci95")
     }
-    kept |= {"status", "sums/status", "sums/strain"}
+    kept |= {"status", *(f"sums/{name}" for name in SUMS)}
     patch.setattr(
         results, "write_dataset", lambda data, path: whole(with_variables(data, *kept), path)
     )

@@ -12,17 +12,17 @@ os.environ.setdefault(
     "TF_CPP_MIN_LOG_LEVEL", "3"
 )  # as the command line does, before JAX is imported
 
-from jaxgran.maps import batches, journal, run_replicas
+from jaxgran.maps import batches, blocks, run
 
 # Seconds between two blocks of a sample: a small map then lasts until something happens to it
 PAUSE = 0.04
-journal.SECONDS = 0.1  # so that its batches have journals
+blocks.SECONDS = 0.1  # so that its batches keep their blocks
 batches.batch_size = lambda *_: 2
 # Drawing takes as long as such a map.
 figures: Any = SimpleNamespace(save_figures=lambda *_, **__: [], pictures_beside=lambda _: set())
 modules: dict[str, Any] = sys.modules
 modules["jaxgran.plotting.map_figures"] = figures
-advance_batch = run_replicas.advance_batch
+advance_batch = run.advance_batch
 FAULT = os.environ.get("FAULT", "")
 
 
@@ -31,7 +31,7 @@ def advance_slowly(*arguments):
     return advance_batch(*arguments)
 
 
-run_replicas.advance_batch = advance_slowly
+run.advance_batch = advance_slowly
 
 if FAULT == "disc full":
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

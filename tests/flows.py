@@ -18,8 +18,8 @@ from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.dynamics.tally import INSTANT, TABLE, Tally
 from jaxgran.maps import batches
-from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.run_replicas import run_replicas
+from jaxgran.maps.replica import Replica, ReplicaId
+from jaxgran.maps.run import run_replicas
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
@@ -91,11 +91,12 @@ def assert_same_tally(one: Tally, two: Tally, rtol: float, but: tuple[str, ...] 
         )
 
 
-def in_batches(size: int, settings: MapSettings, **options: Any) -> dict[Key, Replica]:
+def in_batches(size: int, settings: MapSettings, **options: Any) -> dict[ReplicaId, Replica]:
     """The replicas of a map that are run in batches of a given size."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batches, "batch_size", lambda *_: size)
-        return dict(run_replicas(settings, **options))
+        ids = batches.replica_ids(settings)
+        return {x.id: x for x in run_replicas(settings, ids, **options)}
 
 
 # Fixtures

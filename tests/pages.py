@@ -43,14 +43,14 @@ def page_map() -> xr.DataTree:
         strain=2.0,
         snapshots=True,
     )
-    rng, flows = np.random.default_rng(0), settings.flows()
-    results = {}
-    for point in range(len(flows)):
+    rng, results = np.random.default_rng(0), []
+    for point in range(len(settings.points)):
         status = Status.deep_overlap if point == 7 else Status.ok
         if point != 8:
             state = random_state(point, 64)
-            results[point, 0] = random_replica(rng, settings, status)._replace(state=state)
-            results[point, 1] = random_replica(rng, settings, status)
+            first = random_replica(rng, settings, status, point)
+            results.append(first._replace(state=state))
+            results.append(random_replica(rng, settings, status, point, 1))
     data = map_dataset(settings, results, {"title": MARKUP})
     own = data.force_ratio.assign_attrs(long_name=MARKUP, units="<i>σ</i>") ** 2
     data["own <u>name</u>"] = own.assign_attrs(long_name=MARKUP, units="<i>σ</i>")

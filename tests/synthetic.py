@@ -4,6 +4,7 @@ flow.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -13,7 +14,7 @@ from jaxgran.analysis.contacts import ForceNetwork
 from jaxgran.contact.network import Contacts
 from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.dynamics.tally import TABLE, Tally
-from jaxgran.maps.replica import Replica
+from jaxgran.maps.replica import Replica, ReplicaId
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.checks import InputError
@@ -21,6 +22,7 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
+from jaxgran.sampling.correlation_strain import mass_of_grains
 from jaxgran.sampling.sample import BLOCKS, Sample
 
 SNAPSHOTS = (
@@ -52,14 +54,26 @@ def random_tally(rng: np.random.Generator, *shape: int, status: int = 0) -> Tall
     return Tally(**{**values, "status": np.full(shape, status, np.int32)})
 
 
+def replica_id(settings: MapSettings, point: int, seed: int = 0) -> ReplicaId:
+    """Return what identifies a replica by the number of its point and its seed from the first."""
+    return ReplicaId(*settings.points[point], settings.first_seed + seed)
+
+
 def random_replica(
-    rng: np.random.Generator, settings: MapSettings, status: int = Status.ok, point: int = 0
+    rng: np.random.Generator,
+    settings: MapSettings,
+    status: int = Status.ok,
+    point: int = 0,
+    seed: int = 0,
 ) -> Replica:
     """Return a replica of a map with random sums, the same area for all and a strain of 3 before
     the sample.
     """
-    tally = random_tally(rng, BLOCKS, status=status)
-    return Replica(sample_of_tally(tally, settings.flows()[point]), int(status), 3.0)
+    name = replica_id(settings, point, seed)
+    flow = settings.flows[name.point]
+    sample = sample_of_tally(random_tally(rng, BLOCKS, status=status), flow)
+    mass = mass_of_grains(flow.packing_fraction, sample.area)
+    return Replica(name, replace(sample, mass=mass), int(status), 3.0)
 
 
 def sample_of_tally(tally: Tally, flow: ShearFlow, area: float = 100.0) -> Sample:

@@ -360,7 +360,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "impulses must be an array (2,)": lambda: contact_residual(EVEN, np.zeros(1)),
     # maps
     "must be a list without repetition, in any": lambda: make_map("restitution", (0.5, 0.9, 0.5)),
-    "restitution must be a list of numbers": lambda: make_map(
+    "restitution must be a number or a list of numbers": lambda: make_map(
         "restitution", ((0.1, 0.5), (0.7, 0.9))
     ),
     "without repetition": lambda: make_map("grains", (64, 64)),

@@ -45,8 +45,8 @@ from jaxgran.io.trajectory import read_trajectory
 from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.results import open_map, write_dataset
 from jaxgran.maps.schema import flattened, path_of
-from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.start import combined
+from jaxgran.maps.variables import NOT_RUN
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
@@ -495,12 +495,10 @@ def test_given_options_replace_what_a_file_chose_for_its_error() -> None:
 def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeypatch) -> None:
     asked = []
 
-    def notes(settings, *_) -> Iterator:
+    def notes(settings, *_, **__) -> Iterator:
         asked.append(settings)
-        yield from (
-            ((0, seed), random_replica(np.random.default_rng(seed), settings))
-            for seed in range(settings.seeds)
-        )
+        for seed in range(settings.seeds):
+            yield random_replica(np.random.default_rng(seed), settings, seed=seed)
 
     monkeypatch.setattr(ratio_map_module, "run_replicas", notes)
     flow = ("run", "--restitution", "0.5", "--packing-fraction", "0.6", "--strain", "20", "--quiet")

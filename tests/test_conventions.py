@@ -37,14 +37,12 @@ SKIPPED = ("--skip-checks", "check_cell_methods:M")
 def made(**choices) -> xr.DataTree:
     """Return a map of random numbers with instants, by settings of one's own."""
     settings = MapSettings((0.5, 0.9), (0.5, 0.6), seeds=2, strain=2.0, snapshots=True, **choices)
-    rng, points = np.random.default_rng(0), len(settings.flows())
-    replicas = {
-        (point, seed): random_replica(rng, settings, Status.ok, point)._replace(
-            state=random_state(point)
-        )
-        for point in range(points)
+    rng = np.random.default_rng(0)
+    replicas = [
+        random_replica(rng, settings, Status.ok, point, seed)._replace(state=random_state(point))
+        for point in range(len(settings.points))
         for seed in range(2)
-    }
+    ]
     return map_dataset(settings, replicas, {"command": "jaxgran map"})
 
 

@@ -1,34 +1,30 @@
 """The dataset holds every promised name, survives the disc, and is never left half written."""
 
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import xarray as xr
 from made_up_maps import with_variables
-from synthetic import random_replica, refused
+from synthetic import random_replica, refused, replica_id
 
 from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.dataset import map_dataset
-from jaxgran.maps.point_values import PointValues
-from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.results import is_finished, open_map, write_dataset
+from jaxgran.maps.replica import Replica
+from jaxgran.maps.results import open_map, write_dataset
+from jaxgran.maps.rows import measured_ids
 from jaxgran.maps.schema import ERROR_SOURCES, flattened, path_of
-from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.settings import MapSettings
-from jaxgran.maps.variables import VARIABLES
+from jaxgran.maps.variables import NOT_RUN, PREDICTED
 from jaxgran.model.status import Status
 from jaxgran.sampling.budget import large_system, size_error
 from jaxgran.sampling.enskog_factors import FACTORS, LENGTHS, measured_over_enskog
 from jaxgran.sampling.observables import OBSERVABLES
-from jaxgran.sampling.sample import BLOCKS, ERROR_OBSERVABLES
+from jaxgran.sampling.sample import BLOCKS
 from jaxgran.theory.gaussian_moments import gaussian_moments
 
 ALPHAS, NUS, SEEDS = (0.5, 0.9), (0.5, 0.6), 3
-THEORY = [
-    row.path[7:] for row in VARIABLES if row.path[7:] in OBSERVABLES and row.group == "theory"
-]
 FEW = ("force_ratio", "force_ratio_stderr", "status", "sums/status")
 RUN = {"command": "jaxgran map", "wall_time_seconds": 12.0, "replica_steps_per_second": 1e5}
 
@@ -41,17 +37,17 @@ def settings() -> MapSettings:
 
 
 @pytest.fixture(scope="module")
-def results(settings) -> dict[Key, Replica]:
+def results(settings) -> dict[tuple[int, int], Replica]:
     """All replicas but two of the last point, a bad one, and one that is jammed."""
     rng = np.random.default_rng(0)
     keys = [(point, seed) for point in range(4) for seed in range(SEEDS)][:-2]
     statuses = {(0, 1): Status.iteration_limit, (1, 2): Status.infeasible}
-    return {key: random_replica(rng, settings, statuses.get(key, Status.ok)) for key in keys}
+    return {key: random_replica(rng, settings, statuses.get(key, Status.ok), *key) for key in keys}
 
 
 @pytest.fixture(scope="module")
 def data(settings, results) -> xr.DataTree:
-    return map_dataset(settings, results, RUN)
+    return map_dataset(settings, results.values(), RUN)
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +116,7 @@ def test_every_average_has_the_strain_of_an_independent_sample(data) -> None:
 
 
 def test_prediction_stands_beside_what_is_measured(data) -> None:
-    for name in THEORY:
+    for name in PREDICTED:
         predicted = data["theory"][name]
         measured = data[path_of(name)]
         assert predicted.dims == measured.dims
@@ -132,7 +128,7 @@ def test_prediction_stands_beside_what_is_measured(data) -> None:
 
 def test_factors_and_lengths_are_those_of_the_samples_of_a_point(settings, data, results) -> None:
     samples = [results[0, seed].sample for seed in range(SEEDS)]
-    value, error = measured_over_enskog(settings.flows()[0], samples)
+    value, error = measured_over_enskog(settings.flows[settings.points[0]], samples)
     point = data["theory"].sel(packing_fraction=NUS[0], restitution=ALPHAS[0])
     stored = {f"enskog_factor_pressure_{factor}": f"pressure_{factor}" for factor in FACTORS}
     stored |= {name: name for name in (*LENGTHS, "enskog_pressure")}
@@ -147,8 +143,8 @@ def test_factors_and_lengths_are_those_of_the_samples_of_a_point(settings, data,
 
 def test_elastic_flow_has_no_prediction() -> None:
     """Nothing balances the shear at α = 1."""
-    data = map_dataset(MapSettings((0.5, 1.0), (0.6,), timestep=1e-5, equilibrate=1.0), {}, RUN)
-    for name in THEORY:
+    data = map_dataset(MapSettings((0.5, 1.0), (0.6,), timestep=1e-5, equilibrate=1.0), [], RUN)
+    for name in PREDICTED:
         assert np.isnan(data["theory"][name].values).tolist() == [[False, True]]
 
 
@@ -198,20 +194,21 @@ def test_worst_status_wins_and_is_a_cf_flag(data) -> None:
 
 def test_the_error_that_is_asked_for_is_that_of_all_seeds_together() -> None:
     """One imprecise seed is none of the point, unless another is missing or all are imprecise."""
-    settings = MapSettings((0.2, 0.5, 0.9), (0.6,), grains=64, seeds=2, error=0.1)
-    points = PointValues(settings, {})
-    imprecise = [[Status.imprecise, 0], [Status.imprecise, NOT_RUN], [Status.imprecise, 0]]
-    half = SimpleNamespace(total=np.array([0.05, 0.05, 0.2]), value=np.ones(3))
-    points.__dict__["statuses"] = np.array(imprecise)
-    points.__dict__["large_system"] = dict.fromkeys(ERROR_OBSERVABLES, half)
-    assert points.status.tolist() == [Status.ok, NOT_RUN, Status.imprecise]
+    settings = MapSettings((0.2, 0.5), (0.6,), grains=64, seeds=2, timestep=1e-4, error=0.4)
+    rng = np.random.default_rng(0)
+    replicas = [random_replica(rng, settings, Status.imprecise, point) for point in range(2)]
+    replicas.append(random_replica(rng, settings, Status.ok, 0, 1))
+    assert map_dataset(settings, replicas, RUN).status.values.tolist() == [[Status.ok, NOT_RUN]]
+    finer = replace(settings, error=0.001)
+    assert map_dataset(finer, replicas, RUN).status[0, 0] == Status.imprecise
 
 
 def test_replicas_that_were_given_up_have_failed(settings, results) -> None:
-    given_up = map_dataset(settings, {**results, (0, 0): None}, RUN)
+    lost = Replica(replica_id(settings, 0), None, Status.failed, np.nan)
+    given_up = map_dataset(settings, {**results, (0, 0): lost}.values(), RUN)
     assert given_up["sums/status"][0, 0, 0] == given_up.status[0, 0] == Status.failed
     assert np.isfinite(given_up.force_ratio[0, 0])
-    assert not is_finished(given_up)
+    assert {*measured_ids(given_up)} == {x.id for x in results.values()} - {lost.id}
 
 
 def test_a_jammed_point_has_no_value(settings, results) -> None:
@@ -219,7 +216,9 @@ def test_a_jammed_point_has_no_value(settings, results) -> None:
         key: replica._replace(status=int(Status.infeasible)) if key[0] == 1 else replica
         for key, replica in results.items()
     }
-    point = map_dataset(settings, jammed, RUN).sel(packing_fraction=NUS[0], restitution=ALPHAS[1])
+    point = map_dataset(settings, jammed.values(), RUN).sel(
+        packing_fraction=NUS[0], restitution=ALPHAS[1]
+    )
     assert point.status == Status.infeasible
     for name in (
         "force_ratio",
@@ -233,7 +232,7 @@ def test_a_jammed_point_has_no_value(settings, results) -> None:
 def test_missing_replicas_are_nan_and_not_run(settings, data) -> None:
     missing = data["sums"].sel(packing_fraction=0.6, restitution=0.9).isel(seed=[1, 2])
     assert (missing.status == NOT_RUN).all()
-    nothing = map_dataset(settings, {}, {})
+    nothing = map_dataset(settings, [], {})
     for name in OBSERVABLES:
         assert np.isnan(nothing[path_of(name)]).all(), name
         if OBSERVABLES[name].group != "diagnostics":
@@ -308,8 +307,8 @@ def test_errors_of_a_point_are_those_of_its_own_flow(settings, data) -> None:
                 errors,
                 alpha,
                 nu,
-                settings.grains,
-                settings.timestep,
+                *settings.grains,
+                *settings.timestep,
                 settings.solver.tolerance,
             )
             for name, estimate in estimates.items():
@@ -331,11 +330,10 @@ def test_grains_chosen_by_point_are_in_the_file_and_change_the_error(tmp_path: P
         error=0.1,
         grains_by_point=(64, 256, 256, 1024),
     )
-    assert [flow.grains for flow in chosen.flows()] == [64, 256, 256, 1024]
+    assert [point.grains for point in chosen.points] == [64, 256, 256, 1024]
     rng = np.random.default_rng(0)
-    data = map_dataset(
-        chosen, {(point, 0): random_replica(rng, chosen, Status.ok) for point in range(4)}, RUN
-    )
+    replicas = [random_replica(rng, chosen, Status.ok, point) for point in range(4)]
+    data = map_dataset(chosen, replicas, RUN)
     np.testing.assert_array_equal(data.point_grains, [[64, 256], [256, 1024]])
     for k, grains in enumerate((64, 256, 256, 1024)):
         alpha, nu = ALPHAS[k % 2], NUS[k // 2]

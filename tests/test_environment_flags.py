@@ -11,9 +11,9 @@ from jaxgran.cache import folder
 from jaxgran.environment import usable_cores
 from jaxgran.maps.provenance import random_bits
 from jaxgran.maps.replica import ReplicaId
-from jaxgran.maps.run_replicas import _folded_key, random_key
+from jaxgran.maps.run import _folded_key, random_key
 
-REPLICA = ReplicaId(0.5, 0.6, 64, 1e-3, 3)
+REPLICA = ReplicaId(64, 1e-3, 0.6, 0.5, 3)
 
 
 @pytest.mark.parametrize(

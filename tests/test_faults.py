@@ -66,7 +66,7 @@ class Lab:
         return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
     def wait_for(
-        self, output: str, pattern: str = "journal-*.npz", process: subprocess.Popen | None = None
+        self, output: str, pattern: str = "blocks-*.npz", process: subprocess.Popen | None = None
     ) -> None:
         """Wait until a file of the checkpoint is there."""
         folder, end = self.folder / f"{output}.unfinished", time.monotonic() + PATIENCE

@@ -19,16 +19,15 @@ from synthetic import random_replica, random_state, refused
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.engine import Numba
-from jaxgran.maps.attributes import from_attrs
-from jaxgran.maps.batches import points_of_part, predicted_cost
+from jaxgran.maps.batches import points_of_part, predicted_cost, replica_ids
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.merge import merge_maps
 from jaxgran.maps.ratio_map import ratio_map
-from jaxgran.maps.replica import Key, Replica, ReplicaId, replica_ids
-from jaxgran.maps.results import is_finished, open_map
+from jaxgran.maps.replica import Replica
+from jaxgran.maps.results import open_map
+from jaxgran.maps.rows import measured_ids
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.status_report import bad_points
-from jaxgran.maps.sums import replicas_of
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 
@@ -38,7 +37,7 @@ CLUSTER = Path(__file__).parents[1] / "docs" / "how-to" / "cluster.md"
 
 
 @pytest.fixture(scope="module")
-def replicas() -> dict[Key, Replica]:
+def replicas() -> dict[tuple[int, int], Replica]:
     """The replicas of all points: one that is not steady, one that is infeasible, and one that is
     not finite.
     """
@@ -47,22 +46,19 @@ def replicas() -> dict[Key, Replica]:
         {(0, 1): Status.not_steady, (1, 0): Status.infeasible, (2, 2): Status.nonfinite},
     )
     keys = [(point, seed) for point in range(6) for seed in range(3)]
-    made = {key: random_replica(rng, SETTINGS, bad.get(key, Status.ok), key[0]) for key in keys}
+    made = {key: random_replica(rng, SETTINGS, bad.get(key, Status.ok), *key) for key in keys}
     return {
         key: one._replace(state=random_state(10 * key[0] + key[1])) for key, one in made.items()
     }
 
 
-def of_seeds(replicas: dict[Key, Replica], first: int, count: int, **change: Any) -> xr.DataTree:
+def of_seeds(
+    replicas: dict[tuple[int, int], Replica], first: int, count: int, **change: Any
+) -> xr.DataTree:
     """The map of some of the seeds."""
     settings = replace(SETTINGS, first_seed=first, seeds=count, **change)
-    own = points_of_part(settings)
-    chosen = {
-        (p, s - first): x
-        for (p, s), x in replicas.items()
-        if first <= s < first + count and p in own
-    }
-    return map_dataset(settings, chosen, RUN)
+    own = replica_ids(settings)
+    return map_dataset(settings, [x for x in replicas.values() if x.id in own], RUN)
 
 
 def assert_one_run(merged: xr.DataTree, whole: xr.DataTree, but: tuple[str, ...] = ()) -> None:
@@ -80,7 +76,7 @@ def test_the_files_of_parts_make_the_map_of_one_run(replicas, tmp_path: Path) ->
     whole, files = of_seeds(replicas, 0, 3), []
     for part in ("1/4", "2/4", "3/4", "4/4"):
         data = of_seeds(replicas, 0, 3, part=part)
-        assert is_finished(data) and not bad_points(data).get("not_run")
+        assert not bad_points(data).get("not_run")
         files.append(tmp_path / f"part-{part[0]}.nc")
         data.to_netcdf(files[-1])
     assert_one_run(merge_maps(files), whole)
@@ -119,20 +115,9 @@ def test_a_point_of_fewer_seeds_than_others_is_measured(replicas) -> None:
     assert (merged["sums"].status == -1).sum() == 1 and not bad_points(merged).get("not_run")
 
 
-def identifiers(data: xr.DataTree) -> list[ReplicaId]:
-    """The replicas that a map has measured."""
-    settings = MapSettings(**from_attrs(data))
-    return replica_ids(settings, replicas_of(data, settings))
-
-
-def of_axes(replicas: dict[Key, Replica], **axes: Any) -> xr.DataTree:
+def of_axes(replicas: dict[tuple[int, int], Replica], **axes: Any) -> xr.DataTree:
     """The map at some of the points and seeds, or also at others, which nobody has measured."""
-    settings = replace(SETTINGS, **axes)
-    known = dict(zip(replica_ids(SETTINGS, replicas), replicas.values(), strict=True))
-    keys = list(np.ndindex(len(settings.flows()), settings.seeds))
-    names = zip(keys, replica_ids(settings, keys), strict=True)
-    measured = {key: known[name] for key, name in names if name in known}
-    return map_dataset(settings, measured, RUN, fewer_seeds=True)
+    return map_dataset(replace(SETTINGS, **axes), replicas.values(), RUN, fewer_seeds=True)
 
 
 UNIONS: dict[str, Any] = {
@@ -158,9 +143,8 @@ UNIONS: dict[str, Any] = {
 def test_maps_of_other_axes_make_the_map_of_all_that_they_have(replicas, name: str) -> None:
     *parts, axes = UNIONS[name]
     maps = [of_axes(replicas, **part) for part in parts]
-    seen = {x for one in maps for x in identifiers(one)}
-    known = zip(replica_ids(SETTINGS, replicas), replicas.items(), strict=True)
-    whole = of_axes(dict(item for number, item in known if number in seen), **axes)
+    seen = {x for one in maps for x in measured_ids(one)}
+    whole = of_axes({key: x for key, x in replicas.items() if x.id in seen}, **axes)
     assert_one_run(merge_maps(maps), whole)
 
 
@@ -211,7 +195,7 @@ def test_every_point_is_in_one_part_and_parts_cost_alike(count: int) -> None:
     settings = replace(SETTINGS, packing_fraction=(0.5, 0.6, 0.7, 0.8), timestep=5e-4)
     parts = [points_of_part(replace(settings, part=f"{k + 1}/{count}")) for k in range(count)]
     assert sorted(point for part in parts for point in part) == list(range(12))
-    costs = [predicted_cost(flow) for flow in settings.flows()]
+    costs = [predicted_cost(flow) for flow in settings.flows.values()]
     totals = [sum(costs[point] for point in part) for part in parts]
     assert max(totals) - min(totals) <= max(costs)
 

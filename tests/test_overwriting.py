@@ -95,7 +95,8 @@ def test_a_finished_map_is_taken_from_its_file_by_resume(
     )
     assert "Force ratio" in outcome.out
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
-    assert_one_sentence(jaxgran(tmp_path, *MAP, "--resume", "--grains", "64"))
+    assert_one_sentence(other := jaxgran(tmp_path, *MAP, "--resume", "--grains", "64"))
+    assert "has a map with restitution 0.5, packing fraction 0.6, grains 256" in other.err
 
 
 def test_the_same_map_replaces_a_finished_one_only_where_that_is_said(

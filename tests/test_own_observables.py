@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 from synthetic import refused
 
-from jaxgran.maps import journal
+from jaxgran.maps import blocks
 from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.own_observables import identity_of
 from jaxgran.maps.ratio_map import ratio_map
@@ -72,8 +72,7 @@ def test_variables_have_the_dimensions_of_what_is_returned(observed) -> None:
 def test_an_unfinished_map_goes_on_to_the_same_bits_with_the_same_function_only(
     observed, tmp_path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(journal, "SECONDS", 0.0)
-    monkeypatch.setattr(journal, "WRITING_SHARE", 1e9)
+    monkeypatch.setattr(blocks, "SECONDS", 0.0)
     folder, output = tmp_path / "map.nc.unfinished", tmp_path / "map.nc"
     calls = 0
 
@@ -85,7 +84,7 @@ def test_an_unfinished_map_goes_on_to_the_same_bits_with_the_same_function_only(
 
     with pytest.raises(RuntimeError, match="cut off"):
         ratio_map(**MAP, observe=observe, output=output, progress=cut_off, workers=1)
-    assert list(folder.glob("replica-*")) and list(folder.glob("journal-*"))
+    assert list(folder.glob("replica-*")) and list(folder.glob("blocks-*"))
     for other in (
         None,
         lambda seen: {**observe(seen), "contacts_per_grain": jnp.sum(seen.impulses > 0) / GRAINS},

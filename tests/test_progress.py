@@ -15,7 +15,7 @@ from jaxgran.maps.automatic import (
     expected_seconds,
     plans_of_sizes,
 )
-from jaxgran.maps.batches import predicted_cost, replica_cost
+from jaxgran.maps.batches import predicted_cost, replica_cost, replica_ids
 from jaxgran.maps.progress import Meter
 from jaxgran.maps.replica import Advance
 from jaxgran.maps.results import open_map
@@ -30,6 +30,7 @@ MAP: dict[str, Any] = {
     "timestep": 1e-4,
 }
 SETTINGS, _ = chosen_settings({**MAP, "seeds": 2, "strain": 4.0, "equilibrate": 1.0})
+FLOW = SETTINGS.flows[SETTINGS.points[0]]
 
 
 def shares(meter: Meter) -> tuple[str, str]:
@@ -44,10 +45,10 @@ def test_a_map_whose_points_are_all_unfinished_has_done_a_part_of_its_work() -> 
         shares(meter) == ("0/2 points", "0 % of the work done")
         and "unknown time left" in meter._line()
     )
-    keys = [(0, 0), (0, 1), (1, 0), (1, 1)]
+    ids = replica_ids(SETTINGS)
     for timestep, strain in ((1e-3, 1.0), (1e-4, 0.5), (1e-4, 2.0)):
-        meter.advanced(Advance(keys, np.full(4, timestep), np.full(4, strain / timestep)))
-    coarse, fine = (predicted_cost(SETTINGS.flows()[0], timestep) for timestep in (1e-3, 1e-4))
+        meter.advanced(Advance(ids, np.full(4, timestep), np.full(4, strain / timestep)))
+    coarse, fine = (predicted_cost(FLOW, timestep) for timestep in (1e-3, 1e-4))
     expected = (coarse + 2.5 * fine) / (coarse + 4.5 * fine)
     assert shares(meter) == ("0/2 points", f"{100 * expected:.0f} % of the work done")
     assert meter.done_steps == pytest.approx(4 * 26_000)
@@ -65,22 +66,24 @@ def test_the_time_that_is_left_is_known_before_anything_is_done() -> None:
 
 def test_work_before_a_replica_is_finished_counts_up_to_its_expected_cost() -> None:
     meter = Meter(SETTINGS, expected_costs(SETTINGS), quiet=True)
-    meter.advanced(Advance([(0, 0)], [1e-4], [100]))
+    first, second = replica_ids(SETTINGS)[:2]
+    meter.advanced(Advance([first], [1e-4], [100]))
     assert "unknown time left" in meter._line()  # most of it was compilation
     for _ in range(100):
-        meter.advanced(Advance([(0, 0)], [1e-4], [10_000]))
+        meter.advanced(Advance([first], [1e-4], [10_000]))
     assert "unknown time" not in meter._line()
-    cost = meter.costs[0] / meter.total
+    cost = meter.costs[first.point] / meter.total
     assert shares(meter) == ("0/2 points", f"{95 * cost:.0f} % of the work done")
-    meter.finished((0, 0))
-    meter.finished((0, 1))
+    meter.finished(first)
+    meter.finished(second)
     assert shares(meter) == ("1/2 points", f"{200 * cost:.0f} % of the work done")
 
 
 def test_the_correlation_strain_that_a_map_expects_is_that_of_the_reference_map() -> None:
     data = open_map(RESULTS / "reference.nc").to_dataset()
     settings = MapSettings(**from_attrs(data))
-    flows, count = stack_of_any_size(settings.flows()), [x.grains for x in settings.flows()]
+    flows = stack_of_any_size(list(settings.flows.values()))
+    count = [point.grains for point in settings.points]
     ratio = (
         expected_correlation_strain(settings, flows, count) / data.correlation_strain.values.ravel()
     )
@@ -95,7 +98,7 @@ def test_outside_the_reference_map_the_expected_correlation_strain_is_that_of_ki
     """As the density vanishes and at α → 1 the two agree: nT/τ."""
     nearly_elastic = {"restitution": (0.98, 0.99), "packing_fraction": (0.02,), "timestep": 1e-5}
     settings, _ = chosen_settings({**MAP, **nearly_elastic})
-    flows = stack_of_any_size(settings.flows())
+    flows = stack_of_any_size(list(settings.flows.values()))
     theory = predicted(flows)
     number_density = 4 / np.pi * 0.02
     heating = number_density * theory.granular_temperature / theory.shear_stress
@@ -108,10 +111,11 @@ def test_the_cost_of_a_replica_is_that_of_its_expected_strains() -> None:
     """Preparation and sample are several correlation strains, or what is given."""
     own, _ = chosen_settings({**MAP, "seeds": 1})
     large, _ = chosen_settings({**MAP, "grains": 6400, "seeds": 1})
-    flow = SETTINGS.flows()[0]
-    given = replica_cost(flow, 1.0, 4.0)
-    assert expected_costs(SETTINGS)[0] == given < expected_costs(own)[0]
-    assert expected_costs(large)[0] > 100 * expected_costs(own)[0]
+    given, (large_cost, *_) = replica_cost(FLOW, 1.0, 4.0), expected_costs(large).values()
+    own_cost = expected_costs(own)[own.points[0]]
+    assert expected_costs(SETTINGS)[SETTINGS.points[0]] == given < own_cost
+    assert large_cost > 100 * own_cost
     precise, _ = chosen_settings({**MAP, "grains": 6400, "seeds": 1, "error": 0.05})
     strains = plans_of_sizes(precise, 0.05, np.array([6400])).strain[:, 0]
-    assert expected_costs(precise)[0] > replica_cost(flow, 0.0, strains[0]) * 100
+    precise_cost = expected_costs(precise)[precise.points[0]]
+    assert precise_cost > replica_cost(FLOW, 0.0, strains[0]) * 100

@@ -13,18 +13,18 @@ from command_line import made_up_replicas
 from flows import in_batches
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic import random_replica, refused
+from synthetic import random_replica, refused, replica_id
 
 from jaxgran.maps import ratio_map as ratio_map_module
-from jaxgran.maps import run_replicas as run_replicas_module
+from jaxgran.maps import run as run_module
 from jaxgran.maps.attributes import from_attrs
-from jaxgran.maps.batches import batches, predicted_cost
+from jaxgran.maps.batches import batches, predicted_cost, replica_ids
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.interruption import Interrupted
 from jaxgran.maps.ratio_map import ratio_map
-from jaxgran.maps.replica import Advance, Key, Replica
+from jaxgran.maps.replica import Advance, Point, Replica, ReplicaId
 from jaxgran.maps.results import open_map
-from jaxgran.maps.settings import DEFAULTS, OPTIONS, MapSettings
+from jaxgran.maps.settings import OPTIONS, MapSettings, RunOptions
 from jaxgran.maps.status_report import BadPoints
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
@@ -56,15 +56,15 @@ def reported() -> list[Advance]:
 
 
 @pytest.fixture(scope="module")
-def results(settings, reported) -> dict[Key, Replica]:
+def results(settings, reported) -> dict[ReplicaId, Replica]:
     """The replicas of a map, run in pairs."""
     return in_batches(2, settings, report=reported.append)
 
 
-def assert_same_bits(one: dict[Key, Replica], other: dict[Key, Replica]) -> None:
+def assert_same_bits(one: dict[ReplicaId, Replica], other: dict[ReplicaId, Replica]) -> None:
     assert set(one) == set(other)
-    for key, replica in one.items():
-        jax.tree.map(np.testing.assert_array_equal, replica, other[key])
+    for name, replica in one.items():
+        jax.tree.map(np.testing.assert_array_equal, replica, other[name])
 
 
 numbers = st.floats(0.0, 1.0)
@@ -86,19 +86,20 @@ numbers = st.floats(0.0, 1.0)
 def test_every_replica_runs_once_the_most_expensive_first_and_a_batch_has_one_number_of_grains(
     points, seeds: int
 ) -> None:
-    flows = [ShearFlow(*point) for point in points]
-    settings: Any = SimpleNamespace(part=None, flows=lambda: flows, seeds=seeds, engine=None)
-    tasks = batches(settings)
-    keys = [key for task in tasks for key in task]
-    assert sorted(keys) == [(point, seed) for point in range(len(flows)) for seed in range(seeds)]
-    assert all(len({flows[point].grains for point, _ in task}) == 1 for task in tasks)
+    flows = {Point(n, dt, nu, alpha): ShearFlow(n, alpha, nu, dt) for n, alpha, nu, dt in points}
+    settings: Any = SimpleNamespace(flows=flows)
+    wanted = [ReplicaId(*point, seed) for point in flows for seed in range(seeds)]
+    tasks = batches(settings, wanted)
+    run = [name for task in tasks for name in task]
+    assert sorted(run) == sorted(wanted)
+    assert all(len({name.grains for name in task}) == 1 for task in tasks)
     for first in (
         [task[0] for task in tasks],
-        *([key for key in keys if flows[key[0]].grains == n] for n in (64, 1000)),
+        *([name for name in run if name.grains == n] for n in (64, 1000)),
     ):
-        costs = [predicted_cost(flows[point]) for point, _ in first]
+        costs = [predicted_cost(flows[name.point]) for name in first]
         assert costs == sorted(costs, reverse=True)
-    assert len(tasks) == len(keys)  # on one processor; so no worker is idle
+    assert len(tasks) == len(run)  # on one processor; so no worker is idle
 
 
 def test_cost_of_strain_grows_with_density_and_dissipation_and_less_than_the_number_of_steps() -> (
@@ -116,11 +117,10 @@ def test_results_do_not_depend_on_the_size_company_and_order_of_the_batches(
     settings, results
 ) -> None:
     assert_same_bits(in_batches(1, settings), results)
-    mixed = [
-        *run_replicas_module._run_task(settings, [(1, 1), (0, 0)]),
-        *run_replicas_module._run_task(settings, [(1, 0), (0, 1)]),
-    ]
-    assert_same_bits(dict(mixed), results)
+    pairs = (((1, 1), (0, 0)), ((1, 0), (0, 1)))
+    batches = [[replica_id(settings, *key) for key in pair] for pair in pairs]
+    mixed = [replica for batch in batches for replica in run_module._run_batch(settings, batch)]
+    assert_same_bits({replica.id: replica for replica in mixed}, results)
 
 
 def assert_every_step_is_reported(reported: list[Advance]) -> None:
@@ -141,43 +141,40 @@ def test_a_replica_that_came_to_nothing_keeps_its_status_and_is_in_no_average(
     """Of another time step its force ratio would be another, so it is not run again with a shorter
     one.
     """
-    rng, calls = np.random.default_rng(0), []
-    task = [(0, 0), (0, 1), (1, 0), (1, 1)]
+    rng, calls, keys = np.random.default_rng(0), [], [(0, 0), (0, 1), (1, 0), (1, 1)]
 
-    def measured(_, keys, *__):
-        calls.append(list(keys))
-        return [
-            (key, random_replica(rng, settings, bad if key == (0, 1) else Status.ok))
-            for key in keys
-        ]
+    def measured(_, batch, *__):
+        calls.append(list(batch))
+        statuses = [bad if key == (0, 1) else Status.ok for key in keys]
+        columns = zip(statuses, keys, strict=True)
+        return [random_replica(rng, settings, status, *key) for status, key in columns]
 
-    monkeypatch.setattr(run_replicas_module, "_measured", measured)
-    done = dict(run_replicas_module._run_task(settings, task))
-    assert calls == [task] and [done[key].status for key in task] == [0, bad, 0, 0]
+    monkeypatch.setattr(run_module, "_measured", measured)
+    wanted = replica_ids(settings)
+    done = run_module._run_batch(settings, wanted)
+    assert calls == [wanted] and [x.status for x in done] == [0, bad, 0, 0]
     data = map_dataset(settings, done, {})
-    assert float(data.force_ratio.values.ravel()[0]) == pytest.approx(
-        float(done[0, 0].sample.force_ratio)
-    )
+    assert float(data.force_ratio[0, 0]) == pytest.approx(float(done[0].sample.force_ratio))
 
 
 def test_a_recorder_follows_one_replica_at_a_time(settings, monkeypatch) -> None:
     """Sixty replicas are sampled in batches of four without one."""
     many, sizes = replace(settings, seeds=30), []
 
-    def measured(settings, keys, _, advance, record):
-        record(lambda *_: sizes.append(len(keys)))()
-        return [(key, random_replica(np.random.default_rng(0), settings)) for key in keys]
+    def measured(settings, batch, advance, record):
+        record(lambda *_: sizes.append(len(batch)))()
+        return [random_replica(np.random.default_rng(0), settings) for _ in batch]
 
-    monkeypatch.setattr(run_replicas_module, "_measured", measured)
-    done = dict(run_replicas_module.run_replicas(many, record=lambda advance: advance))
-    assert sizes == [1] * 60 and len(done) == 60
+    monkeypatch.setattr(run_module, "_measured", measured)
+    running = run_module.run_replicas(many, replica_ids(many), record=lambda advance: advance)
+    assert len(list(running)) == 60 and sizes == [1] * 60
 
 
 def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
     settings, results, tmp_path, monkeypatch
 ) -> None:
     """Its numbers stay the same; a single replica that does not fit is an error."""
-    measured, largest, sizes = run_replicas_module._measured, 1, []
+    measured, largest, sizes = run_module._measured, 1, []
 
     def bounded(settings, task, *rest):
         sizes.append(len(task))
@@ -187,28 +184,29 @@ def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
             )
         return measured(settings, task, *rest)
 
-    monkeypatch.setattr(run_replicas_module, "_measured", bounded)
-    tasks = [(0, 0), (0, 1), (1, 0), (1, 1)]
-    halved = run_replicas_module._run_task(settings, tasks, tmp_path / "journal.nc")
+    monkeypatch.setattr(run_module, "_measured", bounded)
+    wanted = replica_ids(settings)
+    halved = run_module._run_batch(settings, wanted, tmp_path / "blocks.npz")
     assert sizes == [4, 2, 1, 1, 2, 1, 1]
-    assert [key for key, _ in halved] == tasks
-    assert_same_bits(dict(halved), results)
+    assert [replica.id for replica in halved] == wanted
+    assert_same_bits({replica.id: replica for replica in halved}, results)
     largest = 0
     with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
-        run_replicas_module._run_task(settings, tasks)
+        run_module._run_batch(settings, wanted)
 
 
 def test_a_replica_has_the_same_numbers_in_every_map_of_the_same_other_settings(
     settings, results
 ) -> None:
     alone = in_batches(2, replace(settings, restitution=(0.9,), seeds=1, first_seed=1))
-    assert_same_bits(alone, {(0, 0): results[1, 1]})
+    same = replica_id(settings, 1, 1)
+    assert_same_bits(alone, {same: results[same]})
 
 
 def test_ratio_map_warns_of_points_and_shows_progress(monkeypatch, capsys) -> None:
-    def found(settings, *_):
-        yield (0, 0), random_replica(np.random.default_rng(0), settings, Status.deep_overlap)
-        yield (1, 0), random_replica(np.random.default_rng(0), settings, Status.ok, 1)
+    def found(settings, *_, **__):
+        yield random_replica(np.random.default_rng(0), settings, Status.deep_overlap)
+        yield random_replica(np.random.default_rng(0), settings, Status.ok, 1)
 
     monkeypatch.setattr(ratio_map_module, "run_replicas", found)
     sentence = r"^1 of 2 points failed: deep overlap at \(restitution 0.5, packing fraction 0.6\)"
@@ -221,13 +219,13 @@ def test_few_replicas_on_an_accelerator_are_told_that_a_processor_is_faster(
     monkeypatch, capsys
 ) -> None:
     few = "4 replicas are few for an accelerator"
-    given = {**DEFAULTS, **SETTINGS, "progress": True}
-    ratio_map_module.settle(given)
+    settings, run = MapSettings(**SETTINGS), RunOptions(progress=True)
+    ratio_map_module.settle(settings, run, "")
     assert few not in capsys.readouterr().err
     monkeypatch.setattr(ratio_map_module, "in_lockstep", lambda: True)
-    ratio_map_module.settle(given)
+    ratio_map_module.settle(settings, run, "")
     assert few in capsys.readouterr().err
-    ratio_map_module.settle(given | {"seeds": 500})
+    ratio_map_module.settle(replace(settings, seeds=500), run, "")
     assert few not in capsys.readouterr().err
 
 
@@ -249,7 +247,7 @@ def test_a_map_that_is_cut_off_is_continued_and_written_once(
         ratio_map(**SETTINGS, tolerance=1e-3, output=str(output), resume=True)
     data = ratio_map(**SETTINGS, output=output, resume=True)
     assert data.attrs["resumed_replicas"] == 2 and not folder.exists()
-    expected = map_dataset(settings, results, {})
+    expected = map_dataset(settings, results.values(), {})
     np.testing.assert_array_equal(data["sums/tally"], expected["sums/tally"])
     monkeypatch.setattr(ratio_map_module, "run_replicas", None)  # nothing is run
     again = ratio_map(**SETTINGS, output=output, resume=True)
@@ -259,8 +257,8 @@ def test_a_map_that_is_cut_off_is_continued_and_written_once(
 
 
 def test_an_interrupted_map_raises_with_its_finished_part(tmp_path, monkeypatch) -> None:
-    def some(settings, *_):
-        yield (1, 0), random_replica(np.random.default_rng(0), settings)
+    def some(settings, *_, **__):
+        yield random_replica(np.random.default_rng(0), settings, point=1)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(ratio_map_module, "run_replicas", some)
@@ -289,13 +287,13 @@ def test_an_interrupted_map_continues_with_more_points(tmp_path, monkeypatch) ->
     xr.testing.assert_equal(
         data.force_ratio.isel(restitution=2), caught.value.data.force_ratio.isel(restitution=1)
     )
-    with refused("already exists and has a map with restitution"):  # it is finished
+    with refused("has a map with restitution 0.7, .* which this one lacks"):
         ratio_map(**SETTINGS, output=output, resume=True)
 
 
 def test_ratio_map_is_the_dataset_of_the_replicas(settings, results) -> None:
     data = ratio_map(**SETTINGS)
-    expected = map_dataset(settings, results, {})
+    expected = map_dataset(settings, results.values(), {})
     np.testing.assert_array_equal(data["sums/tally"], expected["sums/tally"])
     np.testing.assert_array_equal(data.pressure_stderr, expected.pressure_stderr)
     assert set(data.attrs) - set(expected.attrs) == {
@@ -315,10 +313,10 @@ def test_first_of_several_time_steps_has_the_numbers_of_a_map_at_it_alone(
 ) -> None:
     some = replace(settings, timestep=(1e-3, 5e-4))
     both = in_batches(8, some)
-    assert_same_bits(
-        {key: replica for key, replica in both.items() if key[0] < len(settings.flows())}, results
-    )
-    data, alone = map_dataset(some, both, {}), map_dataset(settings, results, {})
+    first = {name: replica for name, replica in both.items() if name.point in settings.points}
+    assert_same_bits(first, results)
+    data = map_dataset(some, both.values(), {})
+    alone = map_dataset(settings, results.values(), {})
     xr.testing.assert_equal(data.isel(timestep=0), alone)
     assert not np.any(data.force_ratio[0] == data.force_ratio[1])
 
@@ -337,21 +335,18 @@ def test_first_of_several_numbers_of_grains_has_the_numbers_of_a_map_at_it_alone
         and data.grains.dtype.kind == "i"
     )
     assert {"long_name", "units"} <= set(data.grains.attrs)
-    alone = map_dataset(
-        replace(settings, seeds=1), {key: x for key, x in results.items() if key[1] == 0}, {}
-    )
+    alone = map_dataset(replace(settings, seeds=1), results.values(), {})
     first = data.isel(grains=0).to_dataset()
     xr.testing.assert_equal(first, alone.to_dataset())
     assert not np.any(data.pressure[0] == data.pressure[1])
-    assert (
-        set(from_attrs(data)["grains"]) == {32, 64}
-        and from_attrs(data.sel(grains=64))["grains"] == 64
-    )
+    assert set(from_attrs(data)["grains"]) == {32, 64} and from_attrs(data.sel(grains=64))[
+        "grains"
+    ] == (64,)
 
 
 def test_the_function_has_the_arguments_of_the_table_and_says_what_they_mean() -> None:
     arguments = inspect.signature(ratio_map).parameters
-    assert [(name, one.default) for name, one in arguments.items()] == [*DEFAULTS.items()]
+    assert [*arguments] == [*OPTIONS]
     for name, option in OPTIONS.items():
         assert f"{name}: {option.help}" in str(ratio_map.__doc__)
     with pytest.raises(TypeError, match="restitutions"):

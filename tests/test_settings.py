@@ -26,7 +26,6 @@ from jaxgran.maps.automatic import (
     sampling_targets,
 )
 from jaxgran.maps.presets import PRESETS
-from jaxgran.maps.replica import replica_ids
 from jaxgran.maps.settings import OPTIONS, MapSettings
 from jaxgran.maps.start import with_start
 from jaxgran.model.checks import InputError
@@ -50,28 +49,29 @@ def test_a_plane_in_any_order_is_sorted_with_the_grains_of_its_points() -> None:
     given = {**GOOD, **mixed, "timestep": (1e-3, 1e-4), "grains_by_point": list(grains.values())}
     settings, _ = chosen(**given)
     assert settings.axes == {
+        "grains": (27,),
         "timestep": (1e-3, 1e-4),
         "packing_fraction": (0.6, 0.7),
         "restitution": (0.1, 0.5, 0.9),
     }
-    for flow in settings.flows():
+    for flow in settings.flows.values():
         assert grains[flow.timestep, flow.packing_fraction, flow.restitution] == flow.grains
 
 
-def test_grains_and_time_step_are_axes_where_they_are_lists_and_then_the_slowest() -> None:
+def test_grains_and_time_step_are_dimensions_where_they_have_several_values() -> None:
     one, some = (
         MapSettings(**GOOD),
         MapSettings(**{**GOOD, "grains": (64, 256), "timestep": (1e-3, 1e-4)}),
     )
     assert (one.sizes, some.sizes) == ((64,), (64, 256))
-    assert list(one.axes) == ["packing_fraction", "restitution"]
-    assert list(some.axes) == ["grains", "timestep", "packing_fraction", "restitution"]
+    assert one.dimensions == ("packing_fraction", "restitution")
+    assert some.dimensions == ("grains", "timestep", "packing_fraction", "restitution")
     points = [
         (flow.grains, flow.timestep, flow.packing_fraction, flow.restitution)
-        for flow in some.flows()
+        for flow in some.flows.values()
     ]
-    assert points == list(product(*some.axes.values()))
-    assert some.flows()[:2] == one.flows()
+    assert points == some.points == list(product(*some.axes.values()))
+    assert some.points[:2] == one.points
 
 
 def chosen(**parameters: Any) -> tuple[MapSettings, str]:
@@ -90,12 +90,12 @@ def test_the_automatic_time_step_is_the_shortest_that_a_point_needs() -> None:
     given = {**GOOD, "timestep": "auto", "grains": (64, 256), "strain": None}
     settings, sentence = chosen(**{**given, **plane})
     alone = [
-        chosen(**{**given, "restitution": [alpha], "packing_fraction": [nu]})[0].timestep
+        chosen(**{**given, "restitution": [alpha], "packing_fraction": [nu]})[0].timestep[0]
         for alpha, nu in product(*plane.values())
     ]
-    assert {flow.timestep for flow in settings.flows()} == {min(alone)} < {*alone}
+    assert settings.timestep == (min(alone),) and len({*alone}) > 1
     assert f"timestep {min(alone):g} / shear rate" in sentence
-    assert chosen(**{**given, **plane, "strain": 1e-3})[0].timestep <= 1e-3 / 160
+    assert chosen(**{**given, **plane, "strain": 1e-3})[0].timestep[0] <= 1e-3 / 160
 
 
 def test_automatic_choices_are_finer_for_a_smaller_error() -> None:
@@ -114,7 +114,7 @@ def test_a_single_number_is_a_plane_of_one_as_on_the_command_line() -> None:
 
 def test_numbers_of_grains_may_be_given_by_point() -> None:
     settings, _ = chosen(**{**GOOD, "grains_by_point": [64, 128]})
-    assert [flow.grains for flow in settings.flows()] == [64, 128] and settings.grains == 128
+    assert [point.grains for point in settings.points] == [64, 128] and settings.grains == (128,)
     for wrong in ([64], 64, [64, 8], [64, 128.5]):
         with pytest.raises(InputError, match="grains"):
             chosen(**{**GOOD, "grains_by_point": wrong})
@@ -134,32 +134,26 @@ def test_the_command_and_the_function_start_alike() -> None:
     """
     python_only = {"observe", "grains_by_point", "progress", "record", "attributes"}
     assert set(MAP_OPTIONS) - {"format", "json", "quiet"} == set(OPTIONS) - python_only
-    assert with_start({}) == PRESETS["quick"]
-    assert (
-        with_start({"error": 0.1}).items()
-        >= {"grains": "auto", "timestep": "auto", "seeds": 1}.items()
-    )
-    assert with_start({"preset": "paper", "seeds": 3})["seeds"] == 3
-    for wrong in (
-        {"preset": "slow"},
-        {"preset": "quick", "from_map": "map.nc"},
-        {"from_map": "no.nc"},
-    ):
+    assert with_start(None, None, {}) == PRESETS["quick"]
+    implied = {"grains": "auto", "timestep": "auto", "seeds": 1}
+    assert with_start(None, None, {"error": 0.1}).items() >= implied.items()
+    assert with_start("paper", None, {"seeds": 3})["seeds"] == 3
+    for wrong in (("slow", None), ("quick", "map.nc"), (None, "no.nc")):
         with refused():
-            with_start(wrong)
+            with_start(*wrong, {})
 
 
 def test_an_error_chooses_grains_by_point_and_one_time_step() -> None:
     given = {"restitution": (0.2, 0.9), "packing_fraction": (0.6, 0.82), "error": 0.1, "seeds": 1}
     settings, sentence = chosen(**given, grains="auto", timestep="auto")
-    flows = settings.flows()
+    flows = list(settings.flows.values())
     for flow in flows:
         assert size_error(flow.restitution, flow.packing_fraction, flow.grains) < 0.1
         assert np.all(sampling_targets(settings, stack([flow])) > 0.02 / 1.96)
     assert len({flow.grains for flow in flows}) > 1
-    assert f"{settings.grains} grains, 1 seed" in sentence and "error of 0.1" in sentence
+    assert f"{settings.grains[0]} grains, 1 seed" in sentence and "error of 0.1" in sentence
     assert "strains of about" in sentence and "processor time" in sentence
-    assert {flow.timestep for flow in flows} == {settings.timestep}
+    assert len(settings.timestep) == 1
 
 
 def test_the_chosen_grains_cost_least_of_those_that_reach_the_error() -> None:
@@ -188,7 +182,7 @@ def test_strain_and_time_of_a_plan_are_those_that_maps_took() -> None:
     """
     data = jg.open_map(RESULTS / "reference_check_small.nc")
     settings = MapSettings(**from_attrs(data))
-    flows = settings.flows()
+    flows = list(settings.flows.values())
     shape = len(flows), -1
     strains = data["sums/strain"].values.reshape(shape)
     prepared = data["sums/equilibration_strain"].values.reshape(shape)
@@ -225,9 +219,7 @@ def test_the_numbers_of_an_axis_are_the_decimals_that_they_stand_for(lists: Any)
     """0.30000000000000004 would be another point, of other random numbers, than 0.3."""
     settings, _ = chosen(**{**GOOD, "restitution": lists, "timestep": 3 * (1e-3 / 10)})
     assert settings.restitution == tuple(float(f"{x:.3g}") for x in lists)
-    assert 0.3 in {
-        x.restitution for x in replica_ids(settings, [(k, 0) for k in range(len(lists))])
-    }
-    assert settings.timestep == 3e-4
+    assert 0.3 in {point.restitution for point in settings.points}
+    assert settings.timestep == (3e-4,)
     with refused("without repetition"):
         chosen(**{**GOOD, "restitution": [0.3, 0.1 + 0.2]})

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import pytest
 
 from jaxgran.dynamics.batch import Cancelled, in_threads
+from jaxgran.maps.batches import replica_ids
 from jaxgran.maps.replica import Advance
-from jaxgran.maps.run_replicas import run_replicas
+from jaxgran.maps.run import run_replicas
 from jaxgran.maps.settings import MapSettings
 
 SECOND = 1.0
@@ -115,7 +116,7 @@ def test_replicas_of_hours_end_within_a_second_of_ctrl_c(ctrl_c) -> None:
             ).start()  # in the middle of a block, of which a replica has 32
 
     with pytest.raises(KeyboardInterrupt):
-        list(run_replicas(ENDLESS, workers=2, report=report))
+        list(run_replicas(ENDLESS, replica_ids(ENDLESS), workers=2, report=report))
     assert time.monotonic() - sent[0] < SECOND
     computing = time.process_time()
     time.sleep(0.2)

@@ -45,7 +45,7 @@ def _as_offered(name: str, row: Option, command: Command) -> Option:
         text = f"{start:g}" if isinstance(start, float) else str(start)
     if command == "run":
         return replace(row, default=text, several=name == "grains")
-    words = " A list adds a dimension." if is_new_dimension(name) else ""
+    words = " Several add a dimension." if is_new_dimension(name) else ""
     return replace(row, default=text, help=row.help + words)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxgran.contact.projected_methods import SOLVERS, solver_name, solver_numbers, solver_text
 from jaxgran.dynamics.engine import engine_named
 from jaxgran.maps.own_observables import identity_of
+from jaxgran.maps.replica import AXES
 from jaxgran.maps.settings import DEFAULTS, MapSettings
 from jaxgran.model.checks import InputError, short_repr
 
@@ -44,11 +45,17 @@ def to_attrs(settings: MapSettings) -> dict[str, Any]:
         "solver_parameters": json.dumps(numbers),
         "max_steps": numbers["max_steps"],
     }
+    values |= {name: _plain(values[name]) for name in AXES}
     return {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in values.items()
         if value is not None
     }
+
+
+def _plain(axis: tuple[float, ...]) -> Any:
+    """The values of an axis, or its one."""
+    return axis[0] if len(axis) == 1 else axis
 
 
 def from_attrs(data: "xr.DataTree") -> dict[str, Any]:
@@ -71,7 +78,7 @@ def from_attrs(data: "xr.DataTree") -> dict[str, Any]:
                 settings[row.name] = tuple(value) if isinstance(value, list) else value
             elif row.default is not None and row.name not in _ADDED:
                 raise KeyError(row.name)
-        for name in ("restitution", "packing_fraction", "grains_by_point", "diameters"):
+        for name in (*AXES, "grains_by_point", "diameters"):
             if name in settings:
                 settings[name] = tuple(np.atleast_1d(settings[name]).tolist())
         before = settings["equilibrate"]
@@ -103,14 +110,11 @@ def identity(settings: MapSettings | Mapping[str, Any]) -> dict[str, Any]:
         values["observe"] = identity_of(settings)
     else:
         values = {row.name: settings.get(row.name, row.default) for row in fields(MapSettings)}
+    values |= {name: _plain(values[name]) for name in AXES}
     solver, engine = values["solver"], values["engine"]
     values["solver"] = solver if isinstance(solver, str) else solver_text(solver)
     values["engine"] = "auto" if engine is None else engine.name
     return json.loads(json.dumps(values, default=lambda number: number.item()))
-
-
-AXES = ("restitution", "packing_fraction", "grains", "timestep", "grains_by_point")
-"""Settings that are the lists of numbers of a map."""
 
 
 def identity_of_replicas(settings: MapSettings | Mapping[str, Any]) -> dict[str, Any]:
@@ -120,7 +124,13 @@ def identity_of_replicas(settings: MapSettings | Mapping[str, Any]) -> dict[str,
     With an ``error`` the number of seeds remains, as the sampled strain depends on it.
     """
     values = identity(settings)
-    apart = {*AXES, "first_seed", "part", *(() if values["error"] else ("seeds",))}
+    apart = {
+        *AXES,
+        "grains_by_point",
+        "first_seed",
+        "part",
+        *(() if values["error"] else ("seeds",)),
+    }
     return {name: value for name, value in values.items() if name not in apart}
 
 

@@ -10,12 +10,12 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxgran.dynamics.batch import predicted_cost
-from jaxgran.maps.batches import points_of_part, replica_cost
+from jaxgran.maps.batches import replica_cost, replica_ids
 from jaxgran.maps.progress import duration
+from jaxgran.maps.replica import Point
 from jaxgran.maps.settings import OPTIONS, MapSettings, rounded
 from jaxgran.maps.settings_checks import (
     FEWEST_STEPS,
-    are_numbers,
     point_text,
     stack_of_any_size,
     temperature_of,
@@ -81,7 +81,7 @@ def plans_of_sizes(settings: MapSettings, error: float, sizes: np.ndarray) -> Pl
     so the sample is long. With many grains the preparation is long, as the correlation strain grows
     as √N. Strain and cost are right within a factor of two or three.
     """
-    flows = stack_of_any_size(settings.flows())
+    flows = stack_of_any_size(list(settings.flows.values()))
     correlation = expected_correlation_strain(settings, flows, sizes[:, None]).T
     alpha = np.asarray(flows.restitution)[:, None]
     target = _targets(settings, error, flows, sizes)
@@ -99,11 +99,11 @@ def plans_of_sizes(settings: MapSettings, error: float, sizes: np.ndarray) -> Pl
     return Plan(np.broadcast_to(sizes, seconds.shape), sampled, seconds)
 
 
-def expected_costs(settings: MapSettings) -> list[float]:
+def expected_costs(settings: MapSettings) -> dict[Point, float]:
     """Relative cost of a whole replica of each point, if it becomes steady and precise when most
     do.
     """
-    flows = settings.flows()
+    flows = list(settings.flows.values())
     count = np.array([flow.grains for flow in flows])
     correlation = expected_correlation_strain(settings, stack_of_any_size(flows), count)
     prepared, sampled, longest = _strains(correlation)
@@ -115,14 +115,14 @@ def expected_costs(settings: MapSettings) -> list[float]:
         expected if given is None else np.full(count.shape, given)
         for given, expected in ((settings.equilibrate, prepared), (settings.strain, sampled))
     )
-    return list(map(replica_cost, flows, *(x.tolist() for x in strains)))
+    costs = map(replica_cost, flows, *(x.tolist() for x in strains))
+    return dict(zip(settings.points, costs, strict=True))
 
 
-def expected_seconds(settings: MapSettings, costs: Sequence[float]) -> float:
-    """Processor time of the measured points by ``expected_costs``, within a factor of three."""
-    flows = settings.flows()
-    scaled = (costs[k] * (flows[k].grains / 1000) ** 0.2 for k in points_of_part(settings))
-    return SECONDS * settings.seeds * sum(scaled)
+def expected_seconds(settings: MapSettings, costs: Mapping[Point, float]) -> float:
+    """Processor time of the replicas by ``expected_costs``, within a factor of three."""
+    replicas = replica_ids(settings)
+    return SECONDS * sum(costs[x.point] * (x.grains / 1000) ** 0.2 for x in replicas)
 
 
 def _strains(correlation: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -229,8 +229,8 @@ def chosen_settings(parameters: Mapping[str, Any]) -> tuple[MapSettings, str]:
             raise InputError("`grains='auto'` requires `error`.", field="grains", value="auto")
         timestep = chosen.get("timestep", checked.timestep)
         plan = _plan(replace(checked, timestep=timestep), checked.error)
-        of_flow = plan.grains.reshape(len(checked.timesteps), -1).max(axis=0)
-        by_point = (*of_flow.tolist(),) * len(checked.timesteps)  # dt compare at one N
+        of_flow = plan.grains.reshape(len(checked.timestep), -1).max(axis=0)
+        by_point = (*of_flow.tolist(),) * len(checked.timestep)  # dt compare at one N
         chosen |= {"grains": max(by_point), "grains_by_point": by_point}
         notes = [
             f"{_range(plan.grains)} grains, {checked.seeds} seed{'s' if checked.seeds > 1 else ''}",
@@ -247,7 +247,7 @@ def _plan(settings: MapSettings, error: float) -> Plan:
     plan = cheapest(settings, error)
     if not np.isfinite(plan.seconds).all():
         worst = int(np.argmax(plan.seconds))
-        where = point_text(stack_of_any_size(settings.flows()), worst)
+        where = point_text(stack_of_any_size(list(settings.flows.values())), worst)
         reason = (
             f"is out of reach at {where} with up to {MAX_GRAINS} grains; take a larger one, more "
             "seeds or a shorter time step"
@@ -273,7 +273,7 @@ def _timestep_for(settings: MapSettings, error: float, strain: Any) -> tuple[flo
     """The time step of an error, and the point that needs it: one for all points, so that their
     force ratios compare.
     """
-    flows = stack_of_any_size(settings.flows())
+    flows = stack_of_any_size(list(settings.flows.values()))
     temperature = temperature_of(settings, flows)
     longest = automatic_timestep(temperature, flows.packing_fraction, flows.activation, error)
     steps = (
@@ -284,14 +284,9 @@ def _timestep_for(settings: MapSettings, error: float, strain: Any) -> tuple[flo
 
 
 def _plain_settings(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters that are fields of ``MapSettings``, with tuples for lists, and a plane of one
-    point for two numbers.
-    """
+    """The parameters that are fields of ``MapSettings``, with tuples for lists."""
     names = [row.name for row in fields(MapSettings) if row.name in parameters]
     plain = {name: _plain(parameters[name], OPTIONS[name].kind) for name in names}
-    for name in ("restitution", "packing_fraction"):
-        if name in plain and are_numbers((plain[name],)):
-            plain[name] = (plain[name],)
     by_point = plain.get("grains_by_point")
     if isinstance(by_point, tuple) and by_point and all(isinstance(x, int) for x in by_point):
         plain["grains"] = max(by_point)

@@ -3,14 +3,14 @@
 So no core is idle for long at the end. The numbers of a replica do not depend on its batch.
 """
 
-from collections.abc import Container
+from collections.abc import Sequence
 from heapq import heappop, heappush
 
 import jax
 
 from jaxgran.dynamics.batch import predicted_cost
 from jaxgran.dynamics.batching import in_lockstep
-from jaxgran.maps.replica import Key
+from jaxgran.maps.replica import ReplicaId
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.thresholds import LEAST_PREPARATION, LEAST_SAMPLE, RELAXATION_STRAIN
@@ -34,13 +34,23 @@ def replica_cost(flow: ShearFlow, equilibrate: float | None, strain: float | Non
     ) * predicted_cost(flow)
 
 
+def replica_ids(settings: MapSettings) -> list[ReplicaId]:
+    """The replicas that a map measures, by point and seed."""
+    points = settings.points
+    return [
+        ReplicaId(*points[k], seed)
+        for k in points_of_part(settings)
+        for seed in settings.seed_numbers
+    ]
+
+
 def points_of_part(settings: MapSettings) -> list[int]:
-    """The points that a map measures: all, or those of its part.
+    """The numbers of the points that a map measures: all, or those of its part.
 
     Each point goes to the part that costs least so far, the most expensive points first. Costs are
     those of ``replica_cost``, which is the same on all machines.
     """
-    flows = settings.flows()
+    flows = list(settings.flows.values())
     if settings.part is None:
         return list(range(len(flows)))
     number, count = map(int, settings.part.split("/"))
@@ -54,32 +64,22 @@ def points_of_part(settings: MapSettings) -> list[int]:
     return sorted(shares[number - 1])
 
 
-def batches(settings: MapSettings, without: Container[Key] = ()) -> list[list[Key]]:
-    """The replicas in batches of one number of grains and of similar cost, the most expensive
-    first.
-    """
-    flows = settings.flows()
-    costs = [predicted_cost(flow) for flow in flows]
-    order = sorted(range(len(costs)), key=lambda point: -costs[point])
-    lockstep, chosen = in_lockstep(), set(points_of_part(settings))
-    tasks: list[list[Key]] = []
-    for grains in {flow.grains: None for flow in flows}:
-        points = [point for point in order if flows[point].grains == grains and point in chosen]
-        keys = [
-            (point, seed)
-            for point in points
-            for seed in range(settings.seeds)
-            if (point, seed) not in without
-        ]
-        most = batch_size(grains, len(keys)) if keys else 0
-        alike: list[list[Key]] = []
-        for key in keys:
-            full = not alike or len(alike[-1]) == most
-            if full or (lockstep and costs[key[0]] < costs[alike[-1][0][0]] / _LARGEST_COST_RATIO):
-                alike.append([])
-            alike[-1].append(key)
-        tasks += alike
-    return sorted(tasks, key=lambda task: -costs[task[0][0]])
+def batches(settings: MapSettings, replicas: Sequence[ReplicaId]) -> list[list[ReplicaId]]:
+    """Replicas in batches of one number of grains and of similar cost, the most expensive first."""
+    costs = {point: predicted_cost(flow) for point, flow in settings.flows.items()}
+    by_cost = sorted(replicas, key=lambda replica: -costs[replica.point])
+    lockstep = in_lockstep()
+    tasks: list[list[ReplicaId]] = []
+    for grains in {replica.grains: None for replica in replicas}:
+        alike = [replica for replica in by_cost if replica.grains == grains]
+        most, batch = batch_size(grains, len(alike)), []
+        for replica in alike:
+            least = costs[batch[0].point] / _LARGEST_COST_RATIO if batch else 0.0
+            if not batch or len(batch) == most or (lockstep and costs[replica.point] < least):
+                batch = []
+                tasks.append(batch)
+            batch.append(replica)
+    return sorted(tasks, key=lambda batch: -costs[batch[0].point])
 
 
 def batch_size(grains: int, count: int) -> int:

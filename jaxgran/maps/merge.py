@@ -3,27 +3,25 @@
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 import xarray as xr
 
 from jaxgran.contact.projected_methods import ProjectedMethod, solver_text
-from jaxgran.maps.attributes import AXES, first_difference, from_attrs, identity_of_replicas
+from jaxgran.maps.attributes import first_difference, from_attrs, identity_of_replicas
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.own_observables import identity_of
 from jaxgran.maps.provenance import DECIDING
-from jaxgran.maps.replica import Replica, ReplicaId, replica_ids
+from jaxgran.maps.replica import AXES, union
 from jaxgran.maps.results import open_map
+from jaxgran.maps.rows import replicas_of
 from jaxgran.maps.settings import MapSettings
-from jaxgran.maps.sums import replicas_of
 from jaxgran.model.checks import InputError, short_repr
 
 _LEFT_OUT = (
-    *(*AXES, "first_seed", "seeds", "part", "part_points"),
+    *(*AXES, "grains_by_point", "first_seed", "seeds", "part", "part_points"),
     *("history", "command", "replica_steps_per_second", "workers"),
 )
 """Attributes of the maps that are not those of the merged one."""
@@ -96,7 +94,7 @@ def _require_same(
         of_run = {name: data.attrs.get(name) for name in _EQUAL}
         compared.append(identity_of_replicas(settings) | of_run)
         if any("grains_by_point" in parameters for parameters in chosen):
-            compared[-1] |= {name: settings.get(name) for name in AXES}
+            compared[-1] |= {name: settings.get(name) for name in (*AXES, "grains_by_point")}
     for name, values in zip(names, compared, strict=True):
         if difference := first_difference(compared[0], values):
             key, *both = difference
@@ -116,20 +114,13 @@ def _union(
         raise InputError(
             f"observe must be the function of the maps, which is {chosen[0].get('observe')}."
         )
-    by_id: dict[ReplicaId, Replica | None] = {}
-    for part, data in zip(parts, maps, strict=True):
-        replicas = replicas_of(data, part)
-        for replica_id, replica in zip(replica_ids(part, replicas), replicas.values(), strict=True):
-            by_id[replica_id] = by_id.get(replica_id) or replica
-    keys = list(np.ndindex(len(settings.flows()), settings.seeds))
-    ids = dict(zip(keys, replica_ids(settings, keys), strict=True))
-    merged = {key: by_id[ids[key]] for key in keys if ids[key] in by_id}
-    return map_dataset(settings, merged, _attributes(maps), fewer_seeds=True)
+    tables = (replicas_of(data, part) for part, data in zip(parts, maps, strict=True))
+    return map_dataset(settings, union(*tables).values(), _attributes(maps), fewer_seeds=True)
 
 
 def _union_of_settings(parts: Sequence[MapSettings]) -> MapSettings:
     """The settings with all values of the axes and all seeds."""
-    seeds = {part.first_seed + seed for part in parts for seed in range(part.seeds)}
+    seeds = {seed for part in parts for seed in part.seed_numbers}
     if missing := {*range(min(seeds), max(seeds))} - seeds:
         raise InputError(
             f"the seeds of the maps must follow one another, and seed {min(missing)} is missing."
@@ -139,12 +130,10 @@ def _union_of_settings(parts: Sequence[MapSettings]) -> MapSettings:
             "maps with an `error` sample by their number of seeds, so they cannot be merged with "
             "other seeds."
         )
-    axes: dict[str, Any] = {}
-    for name in ("restitution", "packing_fraction", "grains", "timestep"):
-        lists = [np.atleast_1d(getattr(part, name)).tolist() for part in parts]
-        values = list(dict.fromkeys(chain(*lists)))
-        is_list = any(isinstance(getattr(part, name), tuple) for part in parts)
-        axes[name] = tuple(values) if is_list or len(values) > 1 else values[0]
+    axes: dict[str, Any] = {
+        name: tuple(dict.fromkeys(value for part in parts for value in part.axes[name]))
+        for name in AXES
+    }
     seeds_of_all = {"first_seed": min(seeds), "seeds": len(seeds), "part": None}
     return replace(parts[0], **axes, **seeds_of_all)
 

@@ -4,15 +4,16 @@ time left.
 
 import math
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from jaxgran.maps.batches import points_of_part, predicted_cost
-from jaxgran.maps.replica import Advance, Key
+from jaxgran.maps.batches import predicted_cost, replica_ids
+from jaxgran.maps.replica import Advance, Point, ReplicaId
 from jaxgran.maps.settings import MapSettings
 
 _SECONDS_BETWEEN_LINES = 10  # without a terminal
@@ -38,14 +39,14 @@ class Meter:
     def __init__(
         self,
         settings: MapSettings,
-        costs: Sequence[float],
+        costs: Mapping[Point, float],
         quiet: bool,
         seconds: float = math.inf,
     ):
-        self.flows, self.costs, self.quiet = settings.flows(), costs, quiet
-        self.left = dict.fromkeys(points_of_part(settings), settings.seeds)
-        self.running: dict[Key, float] = {}  # share of each replica that has been started
-        self.total = sum(self.costs[point] for point in self.left) * settings.seeds
+        self.flows, self.costs, self.quiet = settings.flows, costs, quiet
+        self.left = Counter(replica.point for replica in replica_ids(settings))  # by point
+        self.running: dict[ReplicaId, float] = {}  # share of each replica that has been started
+        self.total = sum(count * costs[point] for point, count in self.left.items())
         self.done_steps, self.done_cost, self.resumed_cost = 0.0, 0.0, 0.0
         self.start = self.last_line = time.perf_counter()
         self.seconds = seconds
@@ -63,31 +64,30 @@ class Meter:
         """Count the steps of an advance."""
         self.done_steps += float(np.sum(advance.steps))
         columns = np.asarray(advance.timestep).tolist(), np.asarray(advance.steps).tolist()
-        for key, timestep, steps in zip(advance.keys, *columns, strict=True):
-            cost = (
-                steps * timestep * predicted_cost(self.flows[key[0]], timestep) / self.costs[key[0]]
-            )
-            self.running[key] = min(self.running.get(key, 0.0) + cost, _MOST_STARTED)
+        for replica, timestep, steps in zip(advance.ids, *columns, strict=True):
+            cost = steps * timestep * predicted_cost(self.flows[replica.point], timestep)
+            share = self.running.get(replica, 0.0) + cost / self.costs[replica.point]
+            self.running[replica] = min(share, _MOST_STARTED)
         self._show()
 
-    def resumed(self, keys: Iterable[Key]) -> None:
+    def resumed(self, replicas: Iterable[ReplicaId]) -> None:
         """Count the replicas of an earlier run, which the estimate of the time left excludes."""
-        for point, _ in keys:
-            self.left[point] -= 1
-            self.resumed_cost += self.costs[point]
+        for replica in replicas:
+            self.left[replica.point] -= 1
+            self.resumed_cost += self.costs[replica.point]
 
-    def finished(self, key: Key) -> None:
+    def finished(self, replica: ReplicaId) -> None:
         """Count a finished replica."""
-        self.running.pop(key, None)
-        self.left[key[0]] -= 1
-        self.done_cost += self.costs[key[0]]
+        self.running.pop(replica, None)
+        self.left[replica.point] -= 1
+        self.done_cost += self.costs[replica.point]
         self._show()
 
     @property
     def _cost_of_run(self) -> float:
         """Cost of the work of this run so far."""
         return self.done_cost + sum(
-            self.costs[point] * share for (point, _), share in self.running.items()
+            self.costs[replica.point] * share for replica, share in self.running.items()
         )
 
     def _show(self) -> None:
@@ -123,7 +123,7 @@ class Meter:
 
 @contextmanager
 def progress(
-    settings: MapSettings, costs: Sequence[float], quiet: bool, seconds: float = math.inf
+    settings: MapSettings, costs: Mapping[Point, float], quiet: bool, seconds: float = math.inf
 ) -> Iterator[Meter]:
     """A ``Meter`` that is shown while the block runs, and once more at its end."""
     meter = Meter(settings, costs, quiet, seconds)

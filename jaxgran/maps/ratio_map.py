@@ -2,16 +2,14 @@
 dataset and a file.
 """
 
-import inspect
 import math
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
-from dataclasses import fields, replace
-from functools import wraps
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing, nullcontext
+from dataclasses import replace
 from time import perf_counter
-from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -21,14 +19,14 @@ from jaxgran.dynamics.batching import in_lockstep
 from jaxgran.dynamics.engine import Engine
 from jaxgran.environment import usable_cores
 from jaxgran.maps.automatic import chosen_settings, expected_costs, expected_seconds
-from jaxgran.maps.checkpoint import Checkpoint
+from jaxgran.maps.batches import replica_ids
 from jaxgran.maps.cluster import Provenance
 from jaxgran.maps.dataset import map_dataset, run_attributes
 from jaxgran.maps.interruption import Interrupted, is_interruption
 from jaxgran.maps.own_observables import sums_by_name
 from jaxgran.maps.progress import progress
-from jaxgran.maps.replica import Advance, Key, Replica
-from jaxgran.maps.run_replicas import run_replicas
+from jaxgran.maps.replica import Advance, Replica, ReplicaId
+from jaxgran.maps.run import run_replicas
 from jaxgran.maps.settings import OPTIONS, MapSettings, RunOptions, table
 from jaxgran.maps.settings_checks import require_engine
 from jaxgran.maps.start import with_start
@@ -38,15 +36,13 @@ from jaxgran.maps.status_report import (
     bad_points_message,
     short_samples_message,
 )
-from jaxgran.maps.store import Store, open_store, replica_count
+from jaxgran.maps.store import Store, open_store
 from jaxgran.maps.variables import COORDINATES, VARIABLES
 from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.choices import Activation
 from jaxgran.model.display import counted
 from jaxgran.sampling.observables import OBSERVABLES
 
-P = ParamSpec("P")
-R = TypeVar("R")
 _OF_RUN = (
     *("engine", "solver", "history", "part_points", "automatic_choice", "resumed_replicas"),
     *("wall_time_seconds", "replica_steps_per_second"),
@@ -56,43 +52,28 @@ _FEW_ON_AN_ACCELERATOR = 1000
 """Replicas below which an accelerator is hardly faster than two cores (``device_batch``)."""
 
 
-def fill_from_start(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator: what is not given comes from the preset or the file that a map starts from."""
-    signature = inspect.signature(function)
-
-    @wraps(function)
-    def started(*args: P.args, **kwargs: P.kwargs) -> R:
-        given = signature.bind(*args, **kwargs).arguments
-        return function(**with_start(given))  # type: ignore[call-arg]
-
-    if function.__doc__:  # none under python -OO
-        started.__doc__ = function.__doc__.replace("{PARAMETERS}", table())
-    return started
-
-
-@fill_from_start
 def ratio_map(
     restitution: float | Sequence[float] | None = None,
     packing_fraction: float | Sequence[float] | None = None,
     *,
-    grains: int | Sequence[int] | Literal["auto"] = 256,
-    seeds: int = 2,
-    timestep: float | Sequence[float] | Literal["auto"] = 1e-3,
+    grains: int | Sequence[int] | Literal["auto"] | None = None,
+    seeds: int | None = None,
+    timestep: float | Sequence[float] | Literal["auto"] | None = None,
     equilibrate: float | None = None,
     strain: float | None = None,
     error: float | None = None,
     tolerance: float | None = None,
     solver: ProjectedMethod | None = None,
-    activation: Activation = "midpoint",
+    activation: Activation | None = None,
     engine: Engine | None = None,
     grains_by_point: Sequence[int] | None = None,
-    snapshots: bool = False,
-    first_seed: int = 0,
+    snapshots: bool | None = None,
+    first_seed: int | None = None,
     observe: Callable[..., Any] | None = None,
-    polydispersity: float = 0.26,
+    polydispersity: float | None = None,
     diameters: Sequence[float] | None = None,
     part: str | None = None,
-    preset: str = "quick",
+    preset: str | None = None,
     from_map: str | os.PathLike | None = None,
     output: str | os.PathLike | None = None,
     overwrite: bool = False,
@@ -106,18 +87,19 @@ def ratio_map(
     """Force ratio, stresses and temperature over a grid of restitutions and packing fractions, with
     errors.
 
-    With ``output``, finished replicas are kept in a folder beside it while the map runs. If
-    ``resume`` is True, an unfinished map of the same parameters is continued, also with other axes,
-    seeds or part, and a finished one is read from its file, if it is of this version; otherwise
-    both are errors. A file is replaced only if ``overwrite`` is True. ``save_figures`` draws the
-    figures of ``jaxgran map``, and ``open_map`` reads the file.
+    What is None has the value of the preset, or of the file that is named by ``from_map``. With
+    ``output``, finished replicas are kept in a folder beside it while the map runs. If ``resume``
+    is True, an unfinished map of the same parameters is continued and a finished one extended, also
+    with more points and seeds: only the replicas that are missing are run. Otherwise both are
+    errors. A file is replaced only if ``overwrite`` is True. ``save_figures`` draws the figures of
+    ``jaxgran map``, and ``open_map`` reads the file.
 
     Args:
       {PARAMETERS}
 
     Returns:
       The DataTree described in ``map_dataset``. It has all observables on (packing_fraction,
-      restitution), with standard errors. Lists of numbers of grains and of time steps add the
+      restitution), with standard errors. Several numbers of grains or time steps add the
       dimensions grains and timestep in front. It also has the status of each point, and all
       parameters as attributes.
 
@@ -136,37 +118,70 @@ def ratio_map(
       >>> data.force_ratio.dims
       ('packing_fraction', 'restitution')
     """
-    settings, run = settle(locals())  # all parameters by name
-    with open_store(settings, run) as store:
-        if store.result is not None:
-            run.tell(f"{store.output} is finished and is read from its file.")
-            return store.result
-        measured = run_missing(settings, run, store)
-        data = map_dataset(settings, measured.replicas, measured.attributes)
-        store.write(data, interrupted=measured.interruption is not None)
-        if measured.interruption is not None:
-            raise Interrupted(data) from measured.interruption
+    run = RunOptions(
+        preset=preset,
+        from_map=from_map,
+        output=output,  # type: ignore[arg-type]
+        overwrite=overwrite,
+        resume=resume,
+        workers=workers,
+        scheduler=scheduler,
+        progress=progress,
+        record=record,
+        attributes=attributes,
+    )
+    given = {
+        "restitution": restitution,
+        "packing_fraction": packing_fraction,
+        "grains": grains,
+        "seeds": seeds,
+        "timestep": timestep,
+        "equilibrate": equilibrate,
+        "strain": strain,
+        "error": error,
+        "tolerance": tolerance,
+        "solver": solver,
+        "activation": activation,
+        "engine": engine,
+        "grains_by_point": grains_by_point,
+        "snapshots": snapshots,
+        "first_seed": first_seed,
+        "observe": observe,
+        "polydispersity": polydispersity,
+        "diameters": diameters,
+        "part": part,
+    }
+    given = {name: value for name, value in given.items() if value is not None}
+    settings, automatic_choice = chosen_settings(with_start(preset, from_map, given))
+    run = settle(settings, run, automatic_choice)
+    if run.output is None:
+        store = nullcontext(None)
+    else:
+        store = open_store(run.output, settings, run.resume, run.overwrite)
+    with store as kept:
+        if kept is not None and kept.finished is not None:
+            run.tell(f"{kept.output} is finished and is read from its file.")
+            return kept.finished
+        replicas, of_run, interruption = _run_missing(settings, run, kept)
+        data = map_dataset(settings, replicas, of_run)
+        if kept is not None:
+            kept.write(data, interrupted=interruption is not None)
+        if interruption is not None:
+            raise Interrupted(data) from interruption
     _warn_of_bad_points(data)
     return data
 
 
-class Measured(NamedTuple):
-    """The replicas of a map, the attributes of their run, and what interrupted it, or None."""
-
-    replicas: dict[Key, Replica | None]
-    attributes: dict[str, Any]
-    interruption: BaseException | None
+if ratio_map.__doc__:  # none under python -OO
+    ratio_map.__doc__ = ratio_map.__doc__.replace("{PARAMETERS}", table())
 
 
-def settle(parameters: Mapping[str, Any]) -> tuple[MapSettings, RunOptions]:
-    """The settings of a map, with numbers for "auto", and how it is run, with the number of
-    workers.
+def settle(settings: MapSettings, run: RunOptions, automatic_choice: str) -> RunOptions:
+    """How a map is run, with the number of workers and all attributes.
 
     Raises:
       InputError: (a ValueError) something cannot be accepted.
     """
-    run = RunOptions(**{row.name: parameters[row.name] for row in fields(RunOptions)})
-    settings, automatic_choice = chosen_settings(parameters)
     require_engine(settings)
     _require_own_observables(settings)
     _require_own_attributes(run, settings)
@@ -174,28 +189,32 @@ def settle(parameters: Mapping[str, Any]) -> tuple[MapSettings, RunOptions]:
     run = replace(run, workers=_workers(run), attributes=attributes)
     if automatic_choice:
         run.tell(f"chosen: {automatic_choice}")
-    if in_lockstep() and replica_count(settings) < _FEW_ON_AN_ACCELERATOR:
+    count = len(replica_ids(settings))
+    if in_lockstep() and count < _FEW_ON_AN_ACCELERATOR:
         run.tell(
-            f"{replica_count(settings)} replicas are few for an accelerator; a processor may "
+            f"{count} replicas are few for an accelerator; a processor may "
             "be faster: set JAX_PLATFORMS=cpu."
         )
-    return settings, run
+    return run
 
 
-def run_missing(settings: MapSettings, run: RunOptions, store: Store) -> Measured:
-    """Run the replicas that the checkpoint lacks."""
-    checkpoint = None if run.record else store.checkpoint
-    if checkpoint is not None and run.resume:
-        _tell_resumed(settings, run, checkpoint)
-    workers, start = min(replica_count(settings), run.workers or 1), perf_counter()
-    results: dict[Key, Replica | None] = {} if checkpoint is None else dict(checkpoint.done)
-    attributes: dict[str, Any] = {"workers": workers, "resumed_replicas": len(results)}
-    made: Provenance = {}
-    interruption = None
+def _run_missing(
+    settings: MapSettings, run: RunOptions, store: Store | None
+) -> tuple[Iterable[Replica], dict[str, Any], BaseException | None]:
+    """Run the replicas that are missing: all that are there then, attributes of the run, and what
+    interrupted it.
+    """
+    done: dict[ReplicaId, Replica] = {} if store is None else dict(store.replicas)
+    if store is not None and run.resume:
+        _tell_resumed(settings, run, store)
+    missing = [x for x in replica_ids(settings) if x not in done]
+    workers, start = min(len(missing) or 1, run.workers or 1), perf_counter()
+    resumed, made, interruption = len(done), Provenance(), None
     costs, known = expected_costs(settings), not in_lockstep() and run.scheduler is None
     expected = expected_seconds(settings, costs) / workers if known else math.inf
+    keeping = None if run.record else store
     with progress(settings, costs, run.progress is not True, expected) as meter:
-        meter.resumed(results)
+        meter.resumed(done)
 
         def report(advance: Advance) -> None:
             meter.advanced(advance)
@@ -203,29 +222,41 @@ def run_missing(settings: MapSettings, run: RunOptions, store: Store) -> Measure
                 run.progress(float(np.sum(advance.steps)))
 
         running = run_replicas(
-            settings, workers, report, checkpoint, run.scheduler, run.record, made
+            settings,
+            missing,
+            workers,
+            report,
+            run.scheduler,
+            run.record,
+            blocks_path=None if keeping is None else keeping.blocks_path,
+            made=made,
         )
         try:
             with closing(running):
-                for key, replica in running:
-                    results[key] = replica
-                    meter.finished(key)
+                for replica in running:
+                    if keeping is not None:
+                        keeping.add(replica)
+                    done[replica.id] = replica
+                    meter.finished(replica.id)
         except BaseException as error:
             if not is_interruption(error):
                 raise
             interruption = error
     seconds = perf_counter() - start
-    attributes |= {name: "; ".join(values) for name, values in made.items()}
-    attributes |= {
+    attributes = {
+        "workers": workers,
+        "resumed_replicas": resumed,
+        **{name: "; ".join(values) for name, values in made.items()},
         "wall_time_seconds": seconds,
         "replica_steps_per_second": meter.done_steps / seconds,
+        **(run.attributes or {}),
     }
-    return Measured(results, attributes | (run.attributes or {}), interruption)
+    return done.values(), attributes, interruption
 
 
 def _require_own_observables(settings: MapSettings) -> None:
     """Raise an InputError if one of the user's observables has a name of the map's."""
-    names = {*OBSERVABLES, *COORDINATES, *(row.path.partition("/")[0] for row in VARIABLES)}
+    names = {*OBSERVABLES, *COORDINATES, *(path.partition("/")[0] for path in VARIABLES)}
     for name in sums_by_name(settings) or ():
         if name in names or name.endswith(("_stderr", "_ci95")):
             raise InputError(
@@ -258,14 +289,12 @@ def _workers(run: RunOptions) -> int:
     return run.workers
 
 
-def _tell_resumed(settings: MapSettings, run: RunOptions, checkpoint: Checkpoint) -> None:
+def _tell_resumed(settings: MapSettings, run: RunOptions, store: Store) -> None:
     """Print how much of a map is done, and which files are damaged."""
-    run.tell(
-        f"continued: {len(checkpoint.done)} of {counted(replica_count(settings), 'replica')} done, "
-        f"{counted(len(checkpoint.interrupted), 'batch')} under way."
-    )
-    if checkpoint.damaged:
-        run.tell(f"damaged and computed again: {', '.join(checkpoint.damaged)}.")
+    count = counted(len(replica_ids(settings)), "replica")
+    run.tell(f"continued: {len(store.replicas)} of {count} done.")
+    if store.damaged:
+        run.tell(f"damaged and computed again: {', '.join(store.damaged)}.")
 
 
 def _warn_of_bad_points(data: xr.DataTree) -> None:

@@ -9,7 +9,6 @@ import hashlib
 import os
 from pathlib import Path
 
-import numpy as np
 import xarray as xr
 
 from jaxgran.files import atomic_write, other_version
@@ -70,19 +69,6 @@ def _whole(path: Path) -> bytes:
     if end.startswith(_MARK) and end.removeprefix(_MARK) != hashlib.sha256(content).digest():
         raise ValueError("it is damaged, and not what was written")
     return whole
-
-
-def is_finished(data: xr.DataTree) -> bool:
-    """Whether a map has all its replicas."""
-    status = data["sums"].status
-    flags = dict(
-        zip(status.attrs["flag_meanings"].split(), status.attrs["flag_values"], strict=True)
-    )
-    missing = [flags[name] for name in ("not_run", "failed")]
-    chosen = np.isin(
-        np.arange(data.status.size), data.attrs.get("part_points", range(data.status.size))
-    )
-    return not np.isin(status.values.reshape(chosen.size, -1)[chosen], missing).any()
 
 
 def differences(data: xr.DataTree) -> list[str]:

@@ -19,7 +19,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, fields
-from functools import lru_cache
+from functools import cached_property
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -28,12 +28,16 @@ import numpy as np
 
 from jaxgran.maps.options import Command, Option, option
 from jaxgran.maps.presets import PRESETS
+from jaxgran.maps.replica import AXES, Point
 from jaxgran.model.choices import Activation, EngineName, SolverName
 
 if TYPE_CHECKING:
     from jaxgran.dynamics.engine import Numerics
     from jaxgran.model.flow import ShearFlow
     from jaxgran.model.grains import Grains
+
+PLANE = AXES[2:]
+"""The dimensions that all maps have."""
 
 _POSITIVE = (lambda x: (x > 0) & (x < math.inf), "a positive number")
 _ERROR = (lambda x: (x >= 1e-3) & (x <= 0.5), "between 1e-3 and 0.5")
@@ -45,10 +49,11 @@ _TOLERANCE = (lambda x: (x >= 1e-12) & (x <= 0.1), "between 1e-12 and 0.1")
 class MapSettings:
     """What the numbers of a map depend on, checked, without "auto", and with tuples for lists.
 
-    ``solver`` and ``engine`` are values, see ``ProjectedMethod`` and ``dynamics.engine``; None
-    stands for the default solver and for the automatic choice of an engine. A given ``tolerance``
-    becomes that of the solver. Restitutions and packing fractions are sorted. These and
-    time steps are rounded to ten digits, so that 0.3 and 0.1 + 0.2 are one point.
+    Each of the four axes is a tuple, also where one number is given. ``solver`` and ``engine`` are
+    values, see ``ProjectedMethod`` and ``dynamics.engine``; None stands for the default solver and
+    for the automatic choice of an engine. A given ``tolerance`` becomes that of the solver.
+    Restitutions and packing fractions are sorted. These and time steps are rounded to ten digits,
+    so that 0.3 and 0.1 + 0.2 are one point.
 
     Raises:
       InputError: (a ValueError) a parameter is out of its range.
@@ -61,7 +66,7 @@ class MapSettings:
         None, "Packing fraction, up to 0.83.", several=True, default="of the preset"
     )
     _: KW_ONLY
-    grains: int | tuple[int, ...] = option(
+    grains: tuple[int, ...] = option(
         256,
         'Number of grains; "auto" chooses it for `error`.',
         int,
@@ -70,7 +75,7 @@ class MapSettings:
         short="n",
     )
     seeds: int = option(2, "Independent runs of each point, averaged together.", int)
-    timestep: float | tuple[float, ...] = option(
+    timestep: tuple[float, ...] = option(
         1e-3,
         'Time step of the sample; "auto" takes the longest one that changes the stresses of no '
         "point by more than 2 %, or a share of `error`.",
@@ -158,8 +163,8 @@ class MapSettings:
 
         object.__setattr__(self, "solver", with_tolerance(self.solver, self.tolerance))
         object.__setattr__(self, "tolerance", None)
-        for name in ("restitution", "packing_fraction", "timestep"):
-            object.__setattr__(self, name, _rounded(getattr(self, name)))
+        for name in AXES:
+            object.__setattr__(self, name, _axis(getattr(self, name)))
         check_axes(self)
         self._sort_plane()
         check_settings(self)
@@ -177,27 +182,25 @@ class MapSettings:
             object.__setattr__(self, name, tuple(sorted(getattr(self, name))))
 
     @property
-    def axes(self) -> dict[str, tuple[float, ...]]:
-        """Values of the dimensions of a map by name, outermost first.
+    def axes(self) -> dict[str, tuple[Any, ...]]:
+        """Values of the four axes by name, outermost first."""
+        return {name: getattr(self, name) for name in AXES}
 
-        ``grains`` and ``timestep`` are among them if they are lists.
-        """
-        optional: dict[str, Any] = {"grains": self.grains, "timestep": self.timestep}
-        lists = {name: values for name, values in optional.items() if isinstance(values, tuple)}
-        plane = {"packing_fraction": self.packing_fraction, "restitution": self.restitution}
-        return lists | plane
+    @property
+    def dimensions(self) -> tuple[str, ...]:
+        """The dimensions of a point in the data: the plane, and axes of two or more values."""
+        return tuple(name for name, x in self.axes.items() if name in PLANE or len(x) > 1)
 
     @property
     def sizes(self) -> tuple[int, ...]:
         """The numbers of grains, at least one."""
-        if self.grains_by_point is not None:
-            return tuple(sorted(set(self.grains_by_point)))
-        return self.grains if isinstance(self.grains, tuple) else (self.grains,)
+        by_point = self.grains_by_point
+        return self.grains if by_point is None else tuple(sorted(set(by_point)))
 
     @property
-    def timesteps(self) -> tuple[float, ...]:
-        """The time steps, at least one."""
-        return self.timestep if isinstance(self.timestep, tuple) else (self.timestep,)
+    def seed_numbers(self) -> range:
+        """The numbers of the seeds of every point."""
+        return range(self.first_seed, self.first_seed + self.seeds)
 
     @property
     def numerics(self) -> "Numerics":
@@ -206,23 +209,33 @@ class MapSettings:
 
         return Numerics(self.solver, self.engine)
 
-    def flows(self) -> "list[ShearFlow]":
-        """One flow for each point, in the order of ``axes``: the last one changes fastest."""
-        return list(_kept_flows(self))
+    @property
+    def points(self) -> list[Point]:
+        """All points, in the order of ``axes``: the last one changes fastest."""
+        if self.grains_by_point is None:
+            return [Point(*numbers) for numbers in product(*self.axes.values())]
+        flows = product(self.timestep, self.packing_fraction, self.restitution)
+        sized = zip(self.grains_by_point, flows, strict=True)
+        return [Point(grains, *numbers) for grains, numbers in sized]
 
-    def new_flows(self) -> "list[ShearFlow]":
-        """The same flows, made anew; InputError if a number of a flow is out of its range."""
+    @cached_property
+    def flows(self) -> "dict[Point, ShearFlow]":
+        """The flow of every point; InputError if a number of a flow is out of its range."""
+        return {point: self.flow_at(point) for point in self.points}
+
+    def flow_at(self, point: Point) -> "ShearFlow":
+        """The flow of a point, which may be one of another map."""
         from jaxgran.model.flow import ShearFlow
 
-        points = product(self.timesteps, self.packing_fraction, self.restitution)
-        if self.grains_by_point is None:
-            sized_points = product(self.sizes, points)
-        else:
-            sized_points = zip(self.grains_by_point, points, strict=True)
-        same = {"activation": self.activation, "polydispersity": self.polydispersity}
-        return [
-            ShearFlow(grains, alpha, nu, dt, **same) for grains, (dt, nu, alpha) in sized_points
-        ]
+        grains, timestep, packing_fraction, restitution = point
+        return ShearFlow(
+            grains,
+            restitution,
+            packing_fraction,
+            timestep,
+            activation=self.activation,
+            polydispersity=self.polydispersity,
+        )
 
     def grains_of(self, size: int, replicas: int) -> "Grains | None":
         """The discs (replicas, size) that a flow is given; None where their diameters are
@@ -257,12 +270,9 @@ def rounded(number: Any) -> Any:
     return float(f"{number:.{min(10, np.finfo(type(number)).precision)}g}")
 
 
-def _rounded(values: Any) -> Any:
-    return tuple(map(rounded, values)) if isinstance(values, tuple) else rounded(values)
-
-
-# a map of many points has hundreds of batches
-_kept_flows = lru_cache(maxsize=4)(MapSettings.new_flows)
+def _axis(values: Any) -> Any:
+    """The numbers of an axis, rounded; a tuple also of one."""
+    return tuple(map(rounded, values)) if isinstance(values, tuple) else (rounded(values),)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,8 +283,12 @@ class RunOptions:
       InputError: (a ValueError) an option cannot be accepted.
     """
 
-    preset: str = option(
-        "quick", "Values of all parameters that are not given.", tuple(PRESETS), commands=("map",)
+    preset: str | None = option(
+        None,
+        "Values of all parameters that are not given.",
+        tuple(PRESETS),
+        commands=("map",),
+        default="quick",
     )
     from_map: str | os.PathLike | None = option(
         None,
@@ -293,7 +307,8 @@ class RunOptions:
     overwrite: bool = option(False, "Replace existing files.", bool)
     resume: bool = option(
         False,
-        "Continue an unfinished map of the output, or read the output if it is finished.",
+        "Continue an unfinished map of the output, or extend a finished one: only what is missing is "
+        "run.",
         bool,
     )
     workers: int | None = option(
@@ -363,7 +378,7 @@ def table() -> str:
 def _described(name: str) -> str:
     about = OPTIONS[name]
     unit = f" In {about.unit}." if about.unit else ""
-    dimension = " A list adds a dimension." if is_new_dimension(name) else ""
+    dimension = " Several add a dimension." if is_new_dimension(name) else ""
     return (
         f"{name}: {about.help}{unit}{dimension} Default: {about.default or repr(DEFAULTS[name])}."
     )

@@ -59,20 +59,21 @@ def check_axes(settings: MapSettings) -> None:
     given for all points, and not as a list too.
     """
     for name, values in settings.axes.items():
-        if not isinstance(values, tuple) or len(values) > MAX_REPLICAS:
+        if len(values) > MAX_REPLICAS:
             raise refused(name, values, f"must be a list of at most {MAX_REPLICAS} numbers")
         if len(values) == 0:
             raise refused(name, [], "must be a list of at least one number")
         if not are_numbers(values):
-            raise refused(name, values, "must be a list of numbers")
+            value = values[0] if len(values) == 1 else values
+            raise refused(name, value, "must be a number or a list of numbers")
         if len(set(values)) < len(values):
             raise refused(name, list(values), "must be a list without repetition, in any order")
     by_point = settings.grains_by_point
     if by_point is None:
         return
-    points = len(settings.timesteps) * len(settings.packing_fraction) * len(settings.restitution)
+    points = len(settings.timestep) * len(settings.packing_fraction) * len(settings.restitution)
     listed = isinstance(by_point, tuple) and len(by_point) == points and are_numbers(by_point)
-    if not listed or "grains" in settings.axes:
+    if not listed or len(settings.grains) > 1:
         reason = f"must be a list of {points} numbers, one for each point"
         raise refused("grains_by_point", by_point, reason)
 
@@ -93,12 +94,13 @@ def check_settings(settings: MapSettings) -> None:
         )
     for row in fields(settings):
         value, accepted = getattr(settings, row.name), row.metadata["option"].range
-        if accepted is not None and value is not None and row.name not in settings.axes:
-            require_number(row.name, value, *accepted)
+        if accepted is not None and value is not None:
+            for number in value if row.name in settings.axes else (value,):
+                require_number(row.name, number, *accepted)
     if settings.equilibrate is None and max(settings.restitution) == 1:
         reason = "must be below 1 unless `equilibrate` is given, as elastic grains only heat up"
         raise refused("restitution", 1.0, reason)
-    flows = settings.new_flows()
+    flows = list(settings.flows.values())
     _check_diameters(settings, flows)
     _check_part(settings, points)
     if settings.observe is not None:
@@ -159,7 +161,7 @@ def _check_observe(observe: Any, flow: ShearFlow) -> None:
 
 def _check_timesteps(settings: MapSettings, flows: ShearFlow) -> None:
     """Raise an InputError if a time step does not fit to the flows or to the sampled strain."""
-    shortest, coarsest = min(settings.timesteps), max(settings.timesteps)
+    shortest, coarsest = min(settings.timestep), max(settings.timestep)
     if shortest < SHORTEST_TIMESTEP:
         reason = f"must be at least {SHORTEST_TIMESTEP:g} / shear rate"
         raise refused("timestep", shortest, reason)

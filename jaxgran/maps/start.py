@@ -24,19 +24,21 @@ _OF_ERROR = {"grains": "auto", "timestep": "auto", "seeds": 1}
 """What an error implies; a longer sample is cheaper than a second seed."""
 
 
-def with_start(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters of ``ratio_map``: those given, on top of those of a preset or of a file.
+def with_start(
+    preset: str | None, from_map: str | os.PathLike | None, given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The parameters of a map: those given, on top of those of a preset or of a file.
 
     Raises:
       InputError: (a ValueError) there is no such preset or map, or both are given.
     """
-    preset, from_map = given.get("preset", "quick"), given.get("from_map")
-    if not isinstance(preset, str) or preset not in PRESETS:
+    name = "quick" if preset is None else preset
+    if not isinstance(name, str) or name not in PRESETS:
         *others, last = PRESETS
-        raise refused("preset", preset, f"must be {', '.join(others)} or {last}")
+        raise refused("preset", name, f"must be {', '.join(others)} or {last}")
     if from_map is None:
-        return combined(PRESETS[preset], given)
-    if "preset" in given:
+        return combined(PRESETS[name], given)
+    if preset is not None:
         raise InputError("`preset` and `from_map` exclude each other.", field="preset")
     if not isinstance(from_map, (str, os.PathLike)):
         raise refused("from_map", from_map, "must be a file name")
@@ -47,13 +49,12 @@ def combined(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, An
     """The parameters of a preset or a file, replaced by those that are given and by what these
     imply.
     """
-    named = {name for name, value in given.items() if value is not None}
-    replaced = {name for option in _REPLACED.keys() & named for name in _REPLACED[option]}
+    replaced = {name for option in _REPLACED.keys() & given.keys() for name in _REPLACED[option]}
     kept = {name: value for name, value in start.items() if name not in replaced}
     if "grains_by_point" in kept and _OF_POINTS & given.keys():
         del kept["grains_by_point"]
         kept["grains"] = "auto"  # chosen again, for the points that are given
-    implied = _OF_ERROR if "error" in named else {}
+    implied = _OF_ERROR if "error" in given else {}
     return kept | implied | dict(given)
 
 

@@ -1,26 +1,37 @@
-"""The table of the variables of a map: a row for each, from which ``map_dataset`` makes it and the
-page of the file describes it. The averages have their rows in ``sampling.observables``.
+"""The table of the variables of a map: from it ``map_dataset`` makes them, and the page of the file
+describes them. The averages have their rows in ``sampling.observables``.
 """
 
-from collections.abc import Callable, Mapping
-from itertools import chain
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 
-from jaxgran.maps.point_values import PointValues
-from jaxgran.maps.schema import ERROR_SOURCES, path_of
-from jaxgran.maps.seeds import STATUS_FLAGS
+from jaxgran.maps.schema import path_of
+from jaxgran.model.status import Status
 from jaxgran.sampling.budget import LARGE_SYSTEM, MEASURED_POLYDISPERSITY, MEASURED_RANGES
 from jaxgran.sampling.enskog_factors import FACTORS, LENGTHS
 from jaxgran.sampling.observables import GROUPS, OBSERVABLES, STRESS_UNIT
 
-_COMPRESSED = {"zlib": True, "shuffle": True, "complevel": 4}
-_LONG = {"grain", "quantity"}  # dimensions of many numbers
-_THEORY = "Enskog moments of an anisotropic Gaussian in each size class"
+NOT_RUN = -1
+"""Status of a replica without a result."""
 
+SCALARS = tuple(name for name, row in OBSERVABLES.items() if not (row.extreme or row.tensor))
+"""The averages that have a correlation strain of their own."""
 
+PREDICTED = (
+    "granular_temperature",
+    "pressure",
+    "shear_stress",
+    "dissipation_rate",
+    "collision_rate",
+)
+"""The averages that kinetic theory predicts."""
+
+_FLAGS = {
+    "flag_values": np.array([NOT_RUN, *Status], np.int8),
+    "flag_meanings": " ".join(["not_run", *(status.name for status in Status)]),
+}
 _RANGES = ", ".join(
     f"{name.replace('_', ' ')} {low:g} to {high:g}" for name, (low, high) in MEASURED_RANGES.items()
 )
@@ -37,182 +48,98 @@ LAWS = (
 class Variable(NamedTuple):
     """A row of the table.
 
-    Args:
-      path: NAME in the root, or GROUP/NAME.
+    Attributes:
       meaning: what it is, without its unit.
-      values: its values (points, ...); None if the map has none.
       unit: "1" for a pure number, None for flags.
       dims: its dimensions behind those of a point.
-      stderr: the standard errors of the values, for the variable NAME_stderr.
+      has_error: whether there is also a variable NAME_stderr.
       attrs: further attributes.
     """
 
-    path: str
     meaning: str
-    values: Callable[[PointValues], np.ndarray | None]
     unit: str | None = "1"
     dims: tuple[str, ...] = ()
-    stderr: Callable[[PointValues], np.ndarray] | None = None
+    has_error: bool = False
     attrs: Mapping[str, Any] = {}
 
-    @property
-    def group(self) -> str:
-        return self.path.rpartition("/")[0] or "/"
 
-    def on(self, points: PointValues) -> dict[str, xr.Variable]:
-        """NAME and, if it has errors, NAME_stderr on the points of a map; none without values."""
-        name, unit = self.path.rpartition("/")[2], {} if self.unit is None else {"units": self.unit}
-        values = self.values(points)
-        if values is None:
-            return {}
-        about = {"long_name": self.meaning, **unit, **self.attrs}
-        variables = {name: points.grid.variable(values, about, *self.dims)}
-        if _LONG & {*self.dims}:
-            variables[name].encoding = dict(_COMPRESSED)
-        if self.stderr is not None:
-            about = {"long_name": f"standard error of {self.meaning}", **unit}
-            errors = self.stderr(points)
-            variables[f"{name}_stderr"] = points.grid.variable(errors, about, *self.dims)
-        return variables
+def _averages(group: str) -> dict[str, Variable]:
+    rows = {}
+    for name in GROUPS[group]:
+        row = OBSERVABLES[name]
+        how = "maximum" if row.extreme else "mean (ratio of sums over time steps)"
+        about = {"cell_methods": f"realization: time: {how}"}
+        has_error = group != "diagnostics"
+        rows[path_of(name)] = Variable(row.meaning, row.unit, row.axes, has_error, about)
+    return rows
 
 
-def _average(name: str) -> Variable:
-    row = OBSERVABLES[name]
-    how = "maximum" if row.extreme else "mean (ratio of sums over time steps)"
-    return Variable(
-        path_of(name),
-        row.meaning,
-        lambda points: points.averages.values[name],
-        row.unit,
-        row.axes,
-        None if row.group == "diagnostics" else lambda points: points.averages.stderrs[name],
-        {"cell_methods": f"realization: time: {how}"},
-    )
+def _of_large_system() -> dict[str, Variable]:
+    """The averages of a large system, and the half-widths of their 95 % intervals by source."""
+    rows = {}
+    for name in LARGE_SYSTEM:
+        meaning, unit = f"{OBSERVABLES[name].meaning}, of a large system", OBSERVABLES[name].unit
+        half, about = f"half-width of the 95 % interval of the {meaning}", {"comment": LAWS}
+        rows[f"{name}_large_system"] = Variable(meaning, unit, attrs=about)
+        rows[f"{name}_large_system_ci95"] = Variable(half, unit, ("error_source",), attrs=about)
+    return rows
 
 
-def _large_system(name: str) -> tuple[Variable, Variable]:
-    """The average of a large system, and the half-widths of its 95 % interval by source."""
-    row = OBSERVABLES[name]
-    about = {"comment": LAWS}
-
-    def estimate(points: PointValues) -> np.ndarray:
-        return points.large_system[name].value
-
-    def half_widths(points: PointValues) -> np.ndarray:
-        parts = points.large_system[name]._asdict()
-        return np.stack([parts[source] for source in ERROR_SOURCES], axis=-1)
-
-    path, meaning = f"{name}_large_system", f"{row.meaning}, of a large system"
-    half = f"half-width of the 95 % interval of the {meaning}"
-    return (
-        Variable(path, meaning, estimate, row.unit, attrs=about),
-        Variable(f"{path}_ci95", half, half_widths, row.unit, ("error_source",), attrs=about),
-    )
-
-
-def _prediction(name: str) -> Variable:
-    return Variable(
-        f"theory/{name}",
-        f"kinetic theory's prediction of the {OBSERVABLES[name].meaning}",
-        lambda points: points.prediction(name),
-        OBSERVABLES[name].unit,
-        attrs={"comment": _THEORY},
-    )
-
-
-def _over_enskog(path: str, name: str, meaning: str, unit: str = "1") -> Variable:
-    return Variable(
-        f"theory/{path}",
-        meaning,
-        lambda points: points.over_enskog[0][name],
-        unit,
-        stderr=lambda points: points.over_enskog[1][name],
-    )
-
-
-def _state(name: str, meaning: str, unit: str, *dims: str) -> Variable:
-    return Variable(f"states/{name}", meaning, lambda points: points.states.get(name), unit, dims)
-
-
-VARIABLES: tuple[Variable, ...] = (
-    *map(_average, GROUPS["/"]),
-    Variable(
-        "status",
-        "worst status of a point, over all seeds and of their samples together",
-        lambda points: points.status,
-        None,
-        attrs={**STATUS_FLAGS, "standard_name": "aggregate_quality_flag"},
-    ),
-    Variable(
-        "correlation_strain",
-        "strain over which the flow is correlated, that of one sample",
-        lambda points: points.averages.correlation_strain,
-    ),
-    *chain.from_iterable(map(_large_system, LARGE_SYSTEM)),
-    *map(_average, GROUPS["stresses"]),
-    _prediction("granular_temperature"),
-    _prediction("pressure"),
-    _prediction("shear_stress"),
-    _prediction("dissipation_rate"),
-    _prediction("collision_rate"),
-    _over_enskog(
-        "enskog_pressure",
-        "enskog_pressure",
+def _of_theory() -> dict[str, Variable]:
+    comment = {"comment": "Enskog moments of an anisotropic Gaussian in each size class"}
+    rows = {}
+    for name in PREDICTED:
+        meaning = f"kinetic theory's prediction of the {OBSERVABLES[name].meaning}"
+        rows[f"theory/{name}"] = Variable(meaning, OBSERVABLES[name].unit, attrs=comment)
+    rows["theory/enskog_pressure"] = Variable(
         "contact pressure of Enskog's theory at the measured granular temperature",
         STRESS_UNIT,
-    ),
-    *(
-        _over_enskog(
-            f"enskog_factor_pressure_{name}",
-            f"pressure_{name}",
-            f"contact pressure with {measured} over that with {assumed}",
-        )
-        for name, (measured, assumed) in FACTORS.items()
-    ),
-    *(_over_enskog(name, name, meaning, "sigma") for name, meaning in LENGTHS.items()),
-    *map(_average, GROUPS["diagnostics"]),
-    Variable(
-        "diagnostics/correlation_strain",
-        "strain of one independent sample of an observable",
-        lambda points: np.stack([*points.averages.observable_correlation.values()], axis=-1),
-        dims=("observable",),
-    ),
-    Variable(
-        "sums/status",
-        "status of a seed",
-        lambda points: points.statuses,
+        has_error=True,
+    )
+    for name, (measured, assumed) in FACTORS.items():
+        meaning = f"contact pressure with {measured} over that with {assumed}"
+        rows[f"theory/enskog_factor_pressure_{name}"] = Variable(meaning, has_error=True)
+    for name, meaning in LENGTHS.items():
+        rows[f"theory/{name}"] = Variable(meaning, "sigma", has_error=True)
+    return rows
+
+
+VARIABLES: dict[str, Variable] = {
+    **_averages("/"),
+    "status": Variable(
+        "worst status of a point, over all seeds and of their samples together",
         None,
-        ("seed",),
-        attrs={**STATUS_FLAGS, "standard_name": "quality_flag"},
+        attrs={**_FLAGS, "standard_name": "aggregate_quality_flag"},
     ),
-    Variable("sums/strain", "sampled strain", lambda points: points.strains[0], dims=("seed",)),
-    Variable(
-        "sums/equilibration_strain",
-        "strain sheared before the sample",
-        lambda points: points.strains[1],
-        dims=("seed",),
+    "correlation_strain": Variable("strain over which the flow is correlated, that of one sample"),
+    **_of_large_system(),
+    **_averages("stresses"),
+    **_of_theory(),
+    **_averages("diagnostics"),
+    "diagnostics/correlation_strain": Variable(
+        "strain of one independent sample of an observable", dims=("observable",)
     ),
-    Variable(
-        "sums/area",
-        "area of the cell",
-        lambda points: points.sums.get("area"),
-        "sigma^2",
-        ("seed",),
+    "sums/status": Variable(
+        "status of a seed", None, ("seed",), attrs={**_FLAGS, "standard_name": "quality_flag"}
     ),
-    Variable(
-        "sums/tally",
+    "sums/strain": Variable("sampled strain", dims=("seed",)),
+    "sums/equilibration_strain": Variable("strain sheared before the sample", dims=("seed",)),
+    "sums/area": Variable("area of the cell", "sigma^2", ("seed",)),
+    "sums/tally": Variable(
         "running sums of each block of a sample, in the order of the fields of Tally, then those "
         "of the user's observables",
-        lambda points: points.sums.get("tally"),
         dims=("seed", "block", "quantity"),
     ),
-    _state("positions", "position of a grain, wrapped into the cell", "sigma", "grain", "axis_a"),
-    _state("velocities", "peculiar velocity of a grain", "sigma / t", "grain", "axis_a"),
-    _state("radii", "radius of a grain", "sigma", "grain"),
-    _state("masses", "mass of a grain", "m", "grain"),
-    _state("side", "side of the cell", "sigma"),
-    _state("tilt", "offset of the image row above, in sides", "1"),
-)
+    "states/positions": Variable(
+        "position of a grain, wrapped into the cell", "sigma", ("grain", "axis_a")
+    ),
+    "states/velocities": Variable("peculiar velocity of a grain", "sigma / t", ("grain", "axis_a")),
+    "states/radii": Variable("radius of a grain", "sigma", ("grain",)),
+    "states/masses": Variable("mass of a grain", "m", ("grain",)),
+    "states/side": Variable("side of the cell", "sigma"),
+    "states/tilt": Variable("offset of the image row above, in sides"),
+}
+"""Every variable of a map by its path, NAME in the root or GROUP/NAME."""
 
 COORDINATES: dict[str, dict[str, str]] = {
     "grains": {"long_name": "number of grains", "units": "1"},

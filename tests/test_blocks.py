@@ -1,4 +1,4 @@
-"""A batch that was cut off anywhere goes on from its journal with the bits that it would have
+"""A long batch that was cut off anywhere goes on from its blocks with the bits that it would have
 had.
 """
 
@@ -13,8 +13,9 @@ from synthetic import random_tally
 
 from jaxgran.dynamics.batch import stack
 from jaxgran.io.arrays import CorruptFile
-from jaxgran.maps import journal as journal_module
-from jaxgran.maps.journal import Journal
+from jaxgran.maps import blocks
+from jaxgran.maps.blocks import KeptBlocks
+from jaxgran.maps.replica import ReplicaId
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
@@ -22,7 +23,7 @@ from jaxgran.sampling.observe import advance_batch
 from jaxgran.sampling.sample_batch import sample_batch
 from jaxgran.sampling.steady_state import prepare_batch
 
-KEYS = [(0, 0), (1, 0)]
+IDS = [ReplicaId(32, 1e-2, 0.6, alpha, 0) for alpha in (0.5, 0.9)]
 GRAINS = (
     32  # as in the tests of the protocol and of maps, whose keys are numbers too: compiled once
 )
@@ -30,9 +31,8 @@ GRAINS = (
 
 @pytest.fixture
 def after_every_call(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A journal is written after every call."""
-    monkeypatch.setattr(journal_module, "SECONDS", 0.0)
-    monkeypatch.setattr(journal_module, "WRITING_SHARE", np.inf)
+    """The file is written after every call."""
+    monkeypatch.setattr(blocks, "SECONDS", 0.0)
 
 
 class CutOff(Exception):
@@ -64,13 +64,14 @@ def whole() -> Any:
 
 
 @pytest.mark.parametrize("cuts", [(1,), (5, 20), (3, 3, 3, 40)])
+@pytest.mark.usefixtures("after_every_call")
 def test_a_batch_that_is_cut_off_goes_on_to_the_same_bits(whole, cuts, tmp_path: Path) -> None:
     for calls in cuts:
         try:
-            measured(Journal(tmp_path / "batch.npz", KEYS, cut_after(advance_batch, calls)))
+            measured(KeptBlocks(tmp_path / "batch.npz", IDS, cut_after(advance_batch, calls)))
         except CutOff:
             continue
-    resumed = measured(Journal(tmp_path / "batch.npz", KEYS, advance_batch))
+    resumed = measured(KeptBlocks(tmp_path / "batch.npz", IDS, advance_batch))
     jax.tree.map(np.testing.assert_array_equal, resumed, whole)
 
 
@@ -104,18 +105,18 @@ def test_nothing_is_done_twice(tmp_path: Path) -> None:
         done.append(arguments)
         return fake_drive(*arguments)
 
-    walk(Journal(path, KEYS, counted), 7)
-    again = walk(Journal(path, KEYS, counted), 10)
+    walk(KeptBlocks(path, IDS, counted), 7)
+    again = walk(KeptBlocks(path, IDS, counted), 10)
     assert len(done) == 10
     jax.tree.map(np.testing.assert_array_equal, again, walk(fake_drive, 10))
 
 
 @pytest.mark.usefixtures("after_every_call")
-def test_the_journal_of_others_is_refused(tmp_path: Path) -> None:
+def test_the_blocks_of_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "batch.npz"
-    walk(Journal(path, KEYS, fake_drive), 3)
+    walk(KeptBlocks(path, IDS, fake_drive), 3)
     with pytest.raises(CorruptFile, match="another batch"):
-        Journal(path, [(0, 0), (2, 0)], fake_drive)
-    journal = Journal(path, KEYS, fake_drive)
+        KeptBlocks(path, IDS[:1], fake_drive)
+    kept = KeptBlocks(path, IDS, fake_drive)
     with pytest.raises(CorruptFile, match="another run"):
-        journal(None, None, small_state(), np.array([5, 5]))
+        kept(None, None, small_state(), np.array([5, 5]))
