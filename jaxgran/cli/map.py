@@ -2,28 +2,19 @@
 figures.
 """
 
-import math
 import os
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 
-import numpy as np
-
 from jaxgran.cli.options import FILE, QUIET, command, of_map
-from jaxgran.cli.outcome import (
-    entries,
-    finish,
-    print_large_system,
-    run_map,
-    told_how_to_resume,
-)
-from jaxgran.cli.output import JSON, in_brackets, print_json, print_table, print_text
+from jaxgran.cli.outcome import finish, run_map, told_how_to_resume
+from jaxgran.cli.output import JSON, print_json
+from jaxgran.cli.summary import print_map, summary_of
 from jaxgran.cli.terminal import say, say_cache, say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, refused, short_repr
-from jaxgran.model.choices import HALF_INTERVAL, FileFormat
-from jaxgran.model.display import counted
+from jaxgran.model.choices import FileFormat
 
 MAP_EXAMPLES = {
     "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two "
@@ -81,9 +72,9 @@ def run_map_command(
             to_draw = data if whole else None
             pictures = draw_beside(to_draw, output, format, overwrite, existed, written)
     if json:
-        print_json(entries(data))
+        print_json(summary_of(data))
     elif whole:
-        print_tables(data)
+        print_map(data)
     finish(data, [*([output] if written else []), *pictures], interrupted, quiet, output)
 
 
@@ -127,30 +118,6 @@ def draw_beside(
     return pictures
 
 
-def print_tables(data) -> None:
-    """Print the force ratio and the pressure of every part of a map that has them, and the errors
-    of the averages of a large system.
-    """
-    from jaxgran.maps.schema import parts
-
-    for part in parts(data):
-        if np.isfinite(part.force_ratio).any():
-            size = (
-                f"N = {part.attrs['grains']}" if "grains" in part.coords else "the N of each point"
-            )
-            title = (
-                f"Force ratio by packing fraction ν and restitution α: {size}, dt = "
-                f"{part.attrs['timestep']:g}/γ̇, {part.attrs['activation']} activation"
-            )
-            half = HALF_INTERVAL * part.force_ratio_stderr
-            _print_plane(part, part.force_ratio, half, title)
-            title = f"Pressure of a large system in m/t² (t = 1/γ̇), extrapolated from {size}"
-            half = part.pressure_large_system_ci95.sel(error_source="total")
-            _print_plane(part, part.pressure_large_system, half, title)
-    _print_success_of_theory(data)
-    print_large_system(data)
-
-
 def run_plot_command(
     file: Path,
     output: Path | None = None,
@@ -174,33 +141,3 @@ def run_plot_command(
 
 map_command = command(MAP_OPTIONS, run_map_command)
 plot_command = command(PLOT_OPTIONS, run_plot_command, argument=FILE)
-
-
-def _print_plane(data, values, halves, title: str) -> None:
-    """An average of a map with half-widths of 95 % intervals in brackets; * marks a bad status."""
-    rows = []
-    for nu in data.packing_fraction.values:
-        line = (x.sel(packing_fraction=nu).values for x in (values, halves, data.status))
-        cells = [
-            (in_brackets(value, half) if math.isfinite(value) else "no value") + " *" * bool(status)
-            for value, half, status in zip(*line, strict=True)
-        ]
-        rows.append([f"{nu:g}", *cells])
-    columns = ["ν", *(f"α = {x:g}" for x in data.restitution.values)]
-    about = "In brackets: 95 % half-width of the last digits; bars of figures are standard errors."
-    mark = " *: bad status." if data.status.any() else ""
-    print_table(f"{title}. {about}{mark}", columns, rows)
-
-
-def _print_success_of_theory(data) -> None:
-    """Print at how many points kinetic theory predicts the pressure within 10 %."""
-    from jaxgran.maps.schema import flattened
-
-    flat = flattened(data)
-    if "theory/pressure" not in flat:
-        return
-    error = (flat["theory/pressure"] / flat.pressure_large_system - 1).values
-    if known := np.isfinite(error).sum():
-        right = (abs(error) <= 0.1).sum()
-        words = "Kinetic theory is within 10 % of the pressure of a large system at"
-        print_text(f"{words} {right} of {counted(known, 'point')}.")

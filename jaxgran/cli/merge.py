@@ -3,9 +3,10 @@
 import os
 from pathlib import Path
 
-from jaxgran.cli.map import MAP_OPTIONS, draw_beside, print_tables, require_new_figures
+from jaxgran.cli.map import MAP_OPTIONS, draw_beside, require_new_figures
 from jaxgran.cli.options import OVERWRITE, command
 from jaxgran.cli.outcome import command_line, finish
+from jaxgran.cli.summary import print_map
 from jaxgran.cli.terminal import configured_jax, require_device
 from jaxgran.maps.options import Option
 from jaxgran.maps.settings import OPTIONS
@@ -41,7 +42,7 @@ def run_merge_command(
     data.attrs["command"] = command_line()
     write_dataset(data, output)
     pictures = draw_beside(data, output, format, overwrite, existed, written=True)
-    print_tables(data)
+    print_map(data)
     finish(data, [output, *pictures], interrupted=False)
 
 

@@ -1,4 +1,4 @@
-"""Runs the map or the flow of a command, and prints its errors and its outcome."""
+"""Runs the map or the flow of a command, and tells how it ended."""
 
 import os
 import shlex
@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxgran.cli.options import with_options
-from jaxgran.cli.output import Entry, print_table, print_text
 from jaxgran.cli.terminal import (
     BAD_STATUS,
     configured_jax,
@@ -24,21 +23,7 @@ from jaxgran.cli.terminal import (
 )
 from jaxgran.maps.interruption import Interrupted, is_interruption
 from jaxgran.maps.settings import OPTIONS
-from jaxgran.model.display import counted, to_two_digits, with_error
-
-_PRINTED = {
-    "force_ratio": "force ratio",
-    "pressure": "pressure",
-    "shear_stress": "shear stress",
-    "granular_temperature": "T",
-    "local_granular_temperature": "local T",
-    "macroscopic_friction": "friction τ/p",
-}
-_SOURCES = {"sampling": "sampling", "timestep": "dt", "size": "size"}  # of errors above 0.4 %
-_SMALLER = (
-    "Smaller errors: of sampling by --strain or --seeds, of dt by --timestep, of the size by "
-    "--grains, of all by --error."
-)
+from jaxgran.model.display import counted
 
 
 class Outcome(NamedTuple):
@@ -117,49 +102,6 @@ def _stamp(path: Path | None) -> tuple[int, int] | None:
     return None
 
 
-def entries(data) -> dict[str, Entry]:
-    """The parameters of a flow or of a map, the averages, the shear-stress ratio, and what kinetic
-    theory predicts; lists are by packing fraction, then by restitution.
-    """
-    from jaxgran.maps.schema import flag_names, flattened, path_of, shear_stress_ratio
-    from jaxgran.sampling.budget import LARGE_SYSTEM
-    from jaxgran.sampling.observables import OBSERVABLES
-
-    flat = flattened(data)
-    axes = ("grains", "timestep", "packing_fraction", "restitution")
-    shown = {
-        name: Entry(
-            flat[name].values,
-            flat[name].long_name,
-            flat[name].attrs.get("reduced_unit", flat[name].units),
-        )
-        for name in axes
-        if name in flat
-    }
-    statuses = np.vectorize(flag_names(flat.status).get)(flat.status.values)
-    shown |= {
-        "strain": Entry(flat["sums/strain"].sum("seed").values, "sampled strain of all seeds"),
-        "engine": Entry(data.attrs["engine"], "program that advanced the flow", None),
-        "solver": Entry(data.attrs["solver"], "method of the contact solve", None),
-        "status": Entry(statuses, "worst status", None),
-    }
-    for name, row in OBSERVABLES.items():
-        path, stderr = path_of(name), flat.get(f"{path_of(name)}_stderr")
-        errors = None if stderr is None else stderr.values
-        shown[name] = Entry(flat[path].values, row.meaning, row.unit, errors)
-        if name in LARGE_SYSTEM:
-            total = flat[f"{name}_large_system_ci95"].sel(error_source="total").values
-            large, words = flat[f"{name}_large_system"].values, f"{row.meaning}, of a large system"
-            shown[f"{name}_large_system"] = Entry(large, words, row.unit, ci95=total)
-        if f"theory/{name}" in flat:
-            words = f"{row.meaning}, by kinetic theory"
-            shown[f"theory/{name}"] = Entry(flat[f"theory/{name}"].values, words, row.unit)
-    ratio, error = (x.values for x in shear_stress_ratio(flat))
-    words = "contact shear stress over binary shear stress"
-    shown["shear_stress_ratio"] = Entry(ratio, words, "1", error)
-    return shown
-
-
 def _say_errors(data) -> None:
     """Print the largest relative error beside the requested one, and the sampled strains."""
     from jaxgran.maps.schema import relative_ci95
@@ -178,95 +120,6 @@ def _say_errors(data) -> None:
         f"worst point{lost}; "
         f"sampled strains of {float(strain.min()):g} to {float(strain.max()):g} per seed"
     )
-
-
-def print_large_system(data) -> None:
-    """Print the averages of a large system, and where their errors come from: the values of a flow,
-    for each number of grains, beside kinetic theory; or the medians of a map and the largest ones.
-    """
-    from jaxgran.maps.schema import flattened, parts
-
-    of_flow = data.sizes["packing_fraction"] * data.sizes["restitution"] == 1
-    shown = [
-        part
-        for part in (parts(data) if of_flow else [flattened(data)])
-        if np.isfinite(part.force_ratio).any()
-    ]
-    for part in shown:
-        _print_large_system(part)
-    if shown:
-        print_text(_SMALLER)
-
-
-def _print_large_system(data) -> None:
-    from jaxgran.maps.schema import relative_ci95
-    from jaxgran.maps.variables import MEASURED_FLOWS
-
-    point = data.status.size == 1
-    values = ("large system", "kinetic theory") if point else ("correction", "total")
-    if point:
-        size = f" extrapolated from N = {data.attrs['grains']}" if "grains" in data.attrs else ""
-        title = f"Averages of a large system{size}, ± 95 %; parts of the errors in %"
-    else:
-        title = (
-            "Averages of a large system: correction for N, and half-widths of 95 % intervals by "
-            "source, in %; median over the points, and the largest below it"
-        )
-    if not _are_measured(data):
-        title += f"\nExtrapolated: the corrections were measured at {MEASURED_FLOWS} only"
-    predicted, rows = _predicted(data) if point else {}, []
-    for name, words in _PRINTED.items():
-        errors, large = relative_ci95(data, name), data[f"{name}_large_system"].values
-        sources = {source: _percent(errors[source]) for source in _SOURCES}
-        sources |= {"timestep": ("–", "–")} if name == "force_ratio" else {}
-        medians, largest = zip(*sources.values(), strict=True)
-        if point:
-            total = data[f"{name}_large_system_ci95"].sel(error_source="total").item()
-            value = with_error(large.item(), total)
-            rows.append([words, value, predicted.get(name, ""), *medians])
-            continue
-        both = _percent(large / data[name].values - 1), _percent(errors["total"])
-        rows += [[words, *(x[0] for x in both), *medians]]
-        rows += [["  largest", *(x[1] for x in both), *largest]]
-    print_table(title, ("average", *values, *_SOURCES.values()), rows)
-
-
-def _predicted(data) -> dict[str, str]:
-    """What kinetic theory predicts for one flow, none if it is elastic; its temperature is compared
-    with the local one.
-    """
-    pressure, shear_stress, temperature = (
-        data[f"theory/{x}"].item() for x in ("pressure", "shear_stress", "granular_temperature")
-    )
-    values = {
-        "pressure": pressure,
-        "shear_stress": shear_stress,
-        "local_granular_temperature": temperature,
-        "macroscopic_friction": shear_stress / pressure,
-    }
-    return {name: f"{value:.3g}" for name, value in values.items() if np.isfinite(value)}
-
-
-def _are_measured(data) -> bool:
-    """Whether the laws of a large system were measured for such flows."""
-    from jaxgran.sampling.budget import MEASURED_POLYDISPERSITY, MEASURED_RANGES
-
-    values = {"grains": data.get("point_grains", data.grains)}
-    values |= {name: data[name] for name in ("restitution", "packing_fraction")}
-    within = (
-        bool(((low <= values[name]) & (values[name] <= high)).all())
-        for name, (low, high) in MEASURED_RANGES.items()
-    )
-    return data.attrs.get("polydispersity") == MEASURED_POLYDISPERSITY and all(within)
-
-
-def _percent(part) -> tuple[str, str]:
-    """The median of a part of the error over the points, and the largest one."""
-    known = part[np.isfinite(part)]
-    if known.size == 0:
-        return "", ""
-    largest = known.flat[np.argmax(abs(known))]
-    return to_two_digits(100 * np.median(known)), to_two_digits(100 * largest)
 
 
 def finish(

@@ -2,15 +2,18 @@
 
 An object of ``--json`` has, by name:
 
-=======  ===========================================================================================
-key      content
-=======  ===========================================================================================
-value    a number, a text, true or false, or nested lists of numbers; null for a number that is NaN
-stderr   standard error in the form of the value; null where there is none
-ci95     half-width of the 95 % interval with all errors; null where there is none
-unit     in m, sigma and t, as in a map; "1" for a pure number, null for what is none
-meaning  in words
-=======  ===========================================================================================
+=================  =================================================================================
+key                content
+=================  =================================================================================
+value              a number, a text, true or false, or nested lists of numbers; null for a number
+                   that is NaN
+stderr             standard error in the form of the value; null where there is none
+ci95               half-width of the 95 % interval with all errors; null where there is none
+unit               in m, sigma and t, as in a map; "1" for a pure number, null for what is none
+meaning            in words
+effective_samples  number of independent samples, where it is known
+ci95_by_source     parts of ci95 by the source of the error, where they are known
+=================  =================================================================================
 """
 
 import codecs
@@ -139,13 +142,20 @@ class Entry(NamedTuple):
     unit: str | None = "1"
     stderr: Any = None
     ci95: Any = None
+    effective_samples: Any = None
+    ci95_by_source: Any = None
 
 
 def print_json(entries: Mapping[str, Entry]) -> None:
     """Print the entries on standard output."""
-    keys = ("value", "stderr", "ci95", "unit", "meaning")
+    always = ("value", "stderr", "ci95", "unit", "meaning")
     plain = {
-        name: {key: _plain(getattr(entry, key)) for key in keys} for name, entry in entries.items()
+        name: {
+            key: _plain(value)
+            for key in (*always, "effective_samples", "ci95_by_source")
+            if (value := getattr(entry, key)) is not None or key in always
+        }
+        for name, entry in entries.items()
     }
     print(json.dumps(plain, indent=2, allow_nan=False))
 
@@ -154,6 +164,8 @@ def _plain(value: Any) -> Any:
     """Numbers as those of JSON, which has neither NaN nor infinity."""
     if value is None or isinstance(value, str):
         return value
+    if isinstance(value, Mapping):
+        return {name: _plain(x) for name, x in value.items()}
     if np.ndim(value):
         return [_plain(x) for x in value]
     number = np.asarray(value).item()

@@ -1,6 +1,5 @@
 """The command ``run``: one flow, its averages, and its frames as a trajectory or movie."""
 
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -9,24 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from jaxgran.cli.options import QUIET, command, of_map
-from jaxgran.cli.outcome import entries, finish, print_large_system, run_map
-from jaxgran.cli.output import JSON, print_json, print_table
+from jaxgran.cli.outcome import finish, run_map
+from jaxgran.cli.output import JSON, print_json
+from jaxgran.cli.summary import print_flow, summary_of
 from jaxgran.cli.terminal import configured_jax, say, with_progress
 from jaxgran.io.paths import require_absent
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError, at_most, require_number
-from jaxgran.model.display import counted, with_error
-from jaxgran.sampling.observables import unit_text
+from jaxgran.model.display import counted
 
 MOST_RECORDED = 100_000  # frames of a trajectory
 _RECORDED_STRAIN = 5.0  # sampled strain where frames are recorded and none is given
 _MOVIE_STRAIN, _MOVIE_FRAMES = 0.005, 40  # between frames of a movie, and its frames
-
-_PHYSICS = (  # what is printed without --all, with the shear-stress ratio below the first
-    *("force_ratio", "pressure", "shear_stress", "macroscopic_friction", "inertial_number"),
-    *("granular_temperature", "local_granular_temperature"),
-    *("coordination_number", "collision_rate"),
-)
 
 RUN_EXAMPLES = {
     "A flow in its steady state: averages with errors": "jaxgran run --restitution 0.5 "
@@ -99,13 +92,12 @@ def simulate_flow(
     plane = {"restitution": (restitution,), "packing_fraction": (packing_fraction,)}
     with _complete_at_the_end(trajectory):
         data, interrupted, written = run_map({**plane, **chosen, "record": record}, quiet)
-    if not json and bool(data.force_ratio.notnull().any()):
-        _print_averages(data, all)
-        print_large_system(data)
+    if not json:
+        print_flow(data, all)
     if recorder is not None and recorder.frames:
         _write_frames(files, recorder, film, quiet)
     if json:
-        print_json(entries(data.isel(packing_fraction=0, restitution=0)))
+        print_json(summary_of(data.isel(packing_fraction=0, restitution=0)))
     output = chosen.get("output")
     finish(data, [output] if output is not None and written else [], interrupted, quiet, output)
 
@@ -196,67 +188,3 @@ def _write_frames(files: Mapping[str, Path], recorder: Any, film: Any, quiet: bo
             say(f"wrote {file}: {counted(count, 'frame')}")
     if recorder.status > 0:
         say(lost_forces(recorder.status))
-
-
-def _print_averages(data, all: bool) -> None:
-    """Print the averages with errors, a column for each number of grains; for one of them also
-    effective sample sizes.
-    """
-    from jaxgran.maps.schema import parts
-
-    points = [part.isel(packing_fraction=0, restitution=0) for part in parts(data)]
-    sizes = [f"N = {point.attrs['grains']}" for point in points]
-    title = (
-        f"Averages at {', '.join(sizes)}, dt = {data.attrs['timestep']:g}/γ̇, "
-        f"{data.attrs['activation']} activation\n"
-        f"engine {data.attrs['engine']}, solver {data.attrs['solver']}"
-    )
-    tables = [_rows(point, all) for point in points]
-    if len(tables) == 1:
-        columns = ("observable", "value ±\nstandard error", "unit", "effective\nsamples")
-        print_table(title, columns, tables[0], numbers=False)
-        return
-    rows = [
-        same[0] if len(same[0]) == 1 else [same[0][0], same[0][2], *(row[1] for row in same)]
-        for same in zip(*tables, strict=True)
-    ]
-    columns = ("observable", "unit", *(f"{size} ±\nstandard error" for size in sizes))
-    print_table(title, columns, rows, numbers=False)
-
-
-def _rows(point, all: bool) -> list[list[str]]:
-    """Name, value with error, unit and effective samples of each average; a name alone is the
-    heading of a group.
-    """
-    from jaxgran.maps.schema import path_of, shear_stress_ratio
-    from jaxgran.sampling.enskog_factors import LENGTHS
-    from jaxgran.sampling.observables import GROUPS, OBSERVABLES
-
-    strain = float(point["sums/strain"].sum())
-    correlated = point["diagnostics/correlation_strain"].to_series().to_dict()
-
-    def number(name: str) -> float:
-        return float(point[name]) if name in point else math.nan
-
-    def measured(path: str) -> str:
-        return with_error(number(path), number(f"{path}_stderr"))
-
-    rows: list[list[str]] = []
-    for group, names in (GROUPS if all else {"/": _PHYSICS}).items():
-        rows += [] if group == "/" else [[group.capitalize()]]
-        for name in names:
-            if OBSERVABLES[name].tensor:
-                continue
-            path, unit = path_of(name), unit_text(OBSERVABLES[name].unit)
-            value = f"{number(path):.3g}" if group == "diagnostics" else measured(path)
-            samples = strain / correlated.get(name, math.nan)
-            text = "" if math.isnan(samples) else f"{samples:.3g}"
-            rows.append([name.replace("_", " "), value, unit, text])
-            if name == "force_ratio":
-                ratio = with_error(*map(float, shear_stress_ratio(point)))
-                rows.append(["shear-stress ratio", ratio, "", ""])
-            if name == "binary_dissipation_rate":
-                for length in LENGTHS:
-                    words = length.replace("_", " ")
-                    rows.append([words, measured(f"theory/{length}"), "σ", ""])
-    return rows

@@ -307,8 +307,8 @@ class RunOptions:
     overwrite: bool = option(False, "Replace existing files.", bool)
     resume: bool = option(
         False,
-        "Continue an unfinished map of the output, or extend a finished one: only what is missing is "
-        "run.",
+        "Continue an unfinished map of the output, or extend a finished one: only what is missing "
+        "is run.",
         bool,
     )
     workers: int | None = option(
