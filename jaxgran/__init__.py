@@ -12,7 +12,7 @@ A grid of restitutions α and packing fractions ν as one batch:
     alphas, nus = jnp.array([(0.3, 0.5), (0.9, 0.5), (0.3, 0.7), (0.9, 0.7)]).T
     flows = jg.ShearFlow(grains=64, restitution=alphas, packing_fraction=nus, timestep=1e-3)
     states = jg.prepare(flows, jax.random.split(jax.random.key(0), len(alphas)))  # until steady
-    states, result = jg.sample(flows, states, strain=50.0)  # or jax.vmap(jg.sample, (0, 0, None))
+    states, result = jax.vmap(jg.sample, (0, 0, None))(flows, states, 50.0)  # a strain of 50
     for row in zip(alphas, nus, result.force_ratio, result.errors()["force_ratio"], result.status):
         print("α = {:g}, ν = {:g}: {:.4f} ± {:.4f},".format(*row[:4]), jg.Status(row[4]).name)
 
