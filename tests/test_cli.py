@@ -344,7 +344,8 @@ def parsed(text: str) -> dict[str, Any]:
     """The JSON that a command prints: one object, in which every name has the same keys."""
     entries = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert all(
-        list(entry)[:5] == ["value", "stderr", "ci95", "unit", "meaning"] for entry in entries.values()
+        list(entry)[:5] == ["value", "stderr", "ci95", "unit", "meaning"]
+        for entry in entries.values()
     )
     return entries
 

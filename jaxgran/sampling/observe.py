@@ -3,15 +3,13 @@ digest.
 """
 
 import hashlib
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
@@ -117,37 +115,16 @@ def dimensions_of(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
 
 
 def digest_of(observe: Observe, flow: ShearFlow) -> str:
-    """A hash of what a function computes in a flow: jaxpr, constants of it and of what it calls,
-    and results.
+    """A hash of what a function computes in a flow, with the constants of it and of what it calls:
+    of the program that JAX compiles.
     """
 
     def without(state: State) -> Any:
         return without_contacts(observe_at(observe, flow, state), state.positions.dtype)
 
-    jaxpr, results = jax.make_jaxpr(without, return_shape=True)(_abstract_state(flow.grains))
-    text = re.sub(" at 0x[0-9a-f]+", "", f"{jaxpr} {results}")  # addresses of functions
-    digest = hashlib.sha256(text.encode())
-    for constant in _constants(jaxpr):
-        digest.update(f"{constant.dtype} {constant.shape}".encode() + constant.tobytes())
-    return digest.hexdigest()[:16]
-
-
-def _constants(part: Any) -> Iterator[np.ndarray]:
-    """The arrays in a jaxpr, in the jaxprs of its equations and in their other parameters."""
-    if isinstance(part, ClosedJaxpr):
-        yield from (np.asarray(constant) for constant in part.consts)
-        yield from _constants(part.jaxpr)
-    elif isinstance(part, Jaxpr):
-        for equation in part.eqns:
-            yield from (np.asarray(x.val) for x in equation.invars if isinstance(x, Literal))
-            for _, parameter in sorted(equation.params.items()):
-                yield from _constants(parameter)
-        yield from (np.asarray(x.val) for x in part.outvars if isinstance(x, Literal))
-    elif isinstance(part, (tuple, list)):
-        for element in part:
-            yield from _constants(element)
-    elif isinstance(part, (np.ndarray, jax.Array)):
-        yield np.asarray(part)
+    program = jax.jit(without).lower(_abstract_state(flow.grains)).as_text()
+    results = jax.tree.structure(jax.eval_shape(without, _abstract_state(flow.grains)))
+    return hashlib.sha256(f"{program} {results}".encode()).hexdigest()[:16]
 
 
 def _abstract_state(grains: int) -> State:
