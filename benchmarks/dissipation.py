@@ -29,7 +29,7 @@ from jaxgran.environment import usable_cores
 from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.schema import MapData, flattened
 from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, curve_styles, label_log_axis, styled
-from jaxgran.reference.corrected_shear import (
+from jaxgran.theory.corrected_shear import (
     MEASURED_LAWS,
     CorrelationLaws,
     corrected_shear,

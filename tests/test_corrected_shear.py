@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from benchmarks.output import RESULTS
-from jaxgran.reference.corrected_shear import MEASURED_LAWS, CorrectedShear, corrected_shear
 from jaxgran.sampling.timestep import JAMMING
+from jaxgran.theory.corrected_shear import MEASURED_LAWS, CorrectedShear, corrected_shear
 from jaxgran.theory.enskog import collisional_transfer
 from jaxgran.theory.gaussian_moments import gaussian_moments
 

@@ -13,8 +13,9 @@ from jaxgran.maps.point_values import PointValues
 from jaxgran.maps.schema import ERROR_SOURCES, path_of
 from jaxgran.maps.seeds import STATUS_FLAGS
 from jaxgran.sampling.budget import LARGE_SYSTEM, MEASURED_POLYDISPERSITY, MEASURED_RANGES
-from jaxgran.sampling.enskog_factors import FACTORS, LENGTHS
+from jaxgran.sampling.enskog_factors import LENGTHS
 from jaxgran.sampling.observables import GROUPS, OBSERVABLES, STRESS_UNIT
+from jaxgran.theory.assumptions import ASSUMPTIONS
 
 _COMPRESSED = {"zlib": True, "shuffle": True, "complevel": 4}
 _LONG = {"grain", "quantity"}  # dimensions of many numbers
@@ -165,9 +166,9 @@ VARIABLES: tuple[Variable, ...] = (
         _over_enskog(
             f"enskog_factor_pressure_{name}",
             f"pressure_{name}",
-            f"contact pressure with {measured} over that with {assumed}",
+            f"contact pressure with {assumption.measured} over that with {assumption.assumed}",
         )
-        for name, (measured, assumed) in FACTORS.items()
+        for name, assumption in ASSUMPTIONS.items()
     ),
     *(_over_enskog(name, name, meaning, "sigma") for name, meaning in LENGTHS.items()),
     *map(_average, GROUPS["diagnostics"]),

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Real
+from jaxtyping import Array, Float, Real
 
 Scalar = float | int | Real[Array, ""]
 
@@ -74,12 +73,6 @@ def maxwellian_collision_rate(density: Array, chi: Array, temperature: Array) ->
     ===========  ========  ==========================
     """
     return 2 * jnp.sqrt(jnp.pi * temperature) * density * chi
-
-
-def outside(value: Array, span: Array | np.ndarray) -> Bool[Array, "..."]:
-    """Whether a number is outside the range (2,) of a law, beyond rounding."""
-    slack = 8 * jnp.finfo(value.dtype).eps
-    return (value < span[0] - slack) | (value > span[1] + slack)
 
 
 def as_floats(*values: Scalar) -> list[Float[Array, ""]]:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from jaxgran.theory.gaussian_moments import steady_moments
 from jaxgran.theory.mixture import uniform_mixture
 from jaxgran.theory.navier_stokes import garzo_dufty
-from jaxgran.theory.steady_shear import Scalar, as_floats, outside
+from jaxgran.theory.steady_shear import Scalar, as_floats
 
 Numbers = Array | np.ndarray
 
@@ -175,8 +175,8 @@ def corrected_shear(
         shear_stress_stderr=moments.shear_stress * of_shear,
         correlation_length=length,
         pair_factor=pairs,
-        extrapolated=outside(alpha, laws.restitution_range)
-        | outside(nu, laws.packing_fraction_range),
+        extrapolated=_outside(alpha, laws.restitution_range)
+        | _outside(nu, laws.packing_fraction_range),
     )
 
 
@@ -194,3 +194,9 @@ def pair_factor(laws: CorrelationLaws, alpha: Numbers, nu: Numbers) -> Array:
     return (1 + laws.pairs[0] * loss**5) * (
         1 + laws.pairs[1] * jnp.cbrt(loss) * crowding ** laws.pairs[2]
     )
+
+
+def _outside(value: Array, span: Numbers) -> Bool[Array, "..."]:
+    """Whether a number is outside the range (2,) of a law, beyond rounding."""
+    slack = 8 * jnp.finfo(value.dtype).eps
+    return (value < span[0] - slack) | (value > span[1] + slack)
