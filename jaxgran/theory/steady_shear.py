@@ -62,19 +62,6 @@ def contact_value(packing_fraction: Scalar) -> Float[Array, ""]:
     return (1 - 7 * nu / 16) / (1 - nu) ** 2
 
 
-def maxwellian_collision_rate(density: Array, chi: Array, temperature: Array) -> Array:
-    """Collisions per grain and time of monodisperse discs with Maxwellian velocities.
-
-    ===========  ========  ==========================
-    density      1/σ²      grains per unit area
-    chi          –         contact value of the pairs
-    temperature  m(σ/t)²   granular temperature
-    returns      1/t       collision rate
-    ===========  ========  ==========================
-    """
-    return 2 * jnp.sqrt(jnp.pi * temperature) * density * chi
-
-
 def as_floats(*values: Scalar) -> list[Float[Array, ""]]:
     """The values as arrays of a common floating-point type."""
     dtype = jnp.result_type(float, *values)
