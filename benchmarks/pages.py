@@ -241,7 +241,7 @@ ENVIRONMENT.filters |= {
     "date": lambda number: f"{number // 10000}-{number // 100 % 100:02d}-{number % 100:02d}",
 }
 ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table}
-ENVIRONMENT.globals |= {"timestep_verdicts": timestep_error.verdicts}
+ENVIRONMENT.globals |= {"ASSUMPTIONS": ASSUMPTIONS, "timestep_verdicts": timestep_error.verdicts}
 ENVIRONMENT.globals |= {"SOLVER_GROUPS": GROUPS, "FACTOR_CURVES": CURVES, "SIZE_LAWS": SIZE_LAWS}
 ENVIRONMENT.globals |= {
     function.__name__: function
