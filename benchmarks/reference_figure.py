@@ -70,7 +70,7 @@ def draw(table: Table) -> Figure:
 
 def _draw_errors(axes: Axes, table: Table, x: np.ndarray, y: np.ndarray, where: np.ndarray) -> None:
     """Contours of the error of the pressure, and where each of them may lie."""
-    over, half = table.log("pressure", where)
+    over, half = table.log_estimate("pressure", where)
     error = np.expm1(-over)
     axes.contourf(x, y, abs(error), [0, RIGHT], colors=["0.88"], zorder=0)
     apart = np.min([np.abs(np.log1p(level) + over) for level in LEVELS], axis=0)

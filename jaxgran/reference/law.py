@@ -91,12 +91,8 @@ class ConstitutiveLaw:
     table: Table  # averages of a reference map
 
     def __repr__(self) -> str:
-        ranges = {
-            "restitution": self.restitution_range,
-            "packing_fraction": self.packing_fraction_range,
-        }
-        texts = (f"{name}={low:.3g} to {high:.3g}" for name, (low, high) in ranges.items())
-        return f"ConstitutiveLaw({', '.join(texts)})"
+        ranges = ("{}={:.3g} to {:.3g}".format(name, *self.table.range(name)) for name in PLANE)
+        return f"ConstitutiveLaw({', '.join(ranges)})"
 
     @property
     def restitution_range(self) -> tuple[float, float]:
@@ -139,7 +135,7 @@ class ConstitutiveLaw:
         """Every average at unit shear rate, at coordinates in the range."""
         logs, averages = self.table.series(where, xp), {}
         for name in _UNITS:
-            log, half = self.table.log(name, where, xp)
+            log, half = self.table.log_estimate(name, where, xp)
             log_average = log if name == LENGTH else log + logs[theory_of(name)]
             averages[name] = from_log(log_average, half, xp)
         return averages

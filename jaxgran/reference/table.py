@@ -142,7 +142,7 @@ class Table:
             bounds[name] = Surface(self.points, values, stderrs, _BOUND_SHAPE)
         return bounds
 
-    def log(self, name: str, where: Any, xp: Any = np) -> tuple[Any, Any]:
+    def log_estimate(self, name: str, where: Any, xp: Any = np) -> tuple[Any, Any]:
         """The logarithm of an average over the theory's, or of a factor or ``LENGTH``, and the
         half-width of its 95 % interval.
         """

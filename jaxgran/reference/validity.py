@@ -207,7 +207,7 @@ def _answer(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
     measured, theory, error, corrected, corrected_error = {}, {}, {}, {}, {}
     logs = table.series(where, xp)
     for name in MEASURED:
-        log, half = table.log(name, where, xp)
+        log, half = table.log_estimate(name, where, xp)
         log_theory, log_corrected = (logs[x + theory_of(name)] for x in ("", CORRECTED))
         measured[name] = from_log(log + log_theory, half, xp)
         if not name.startswith("local_"):
@@ -220,7 +220,8 @@ def _answer(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
     ci95 = xp.hypot(sampling, xp.exp(table.bounds[RATIO].mean(where, xp)))
     measured[RATIO] = Estimate(1 + excess_from_surface(value, xp), ci95)
     factors = {
-        name: from_log(*table.log(f"pressure_{name}", where, xp), xp) for name in ASSUMPTIONS
+        name: from_log(*table.log_estimate(f"pressure_{name}", where, xp), xp)
+        for name in ASSUMPTIONS
     }
     return measured, theory, error, corrected, corrected_error, factors
 
