@@ -29,6 +29,8 @@ from jaxgran.theory.assumptions import ASSUMPTIONS, NEGLIGIBLE
 COLUMNS = ("average", "measured", "theory", "error", "error if corrected")
 """What ``Validity.rows`` gives of every average."""
 
+_BINARY = 0.05  # excess of the force ratio below which collisions are said to be binary
+
 
 class Validity(NamedTuple):
     """What was measured at a restitution and a packing fraction, and what kinetic theory says.
@@ -143,7 +145,7 @@ def _verdict(flow: Validity) -> str:
     ratio, ratio_ci95 = map(float, flow.measured[RATIO])
     excess = max(ratio - 1, 0.0) + ratio_ci95
     step = f"dt = {shipped_table().timestep}/γ̇"
-    if excess < 0.05:
+    if excess < _BINARY:
         most = 1 + float(f"{excess:.1g}")
         binary = f"Collisions are binary (force ratio at most {most:g}, {step})"
     else:
