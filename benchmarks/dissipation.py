@@ -14,7 +14,6 @@ also judge the temperature and the stresses of ``corrected_shear``.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import jax
 import numpy as np
@@ -29,7 +28,7 @@ from jaxgran.environment import usable_cores
 from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.schema import MapData, flattened
 from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, curve_styles, label_log_axis, styled
-from jaxgran.reference.corrected_shear import (
+from jaxgran.theory.corrected_shear import (
     MEASURED_LAWS,
     CorrelationLaws,
     corrected_shear,
@@ -300,13 +299,16 @@ def rms(x: np.ndarray) -> float:
 # corrected theory
 
 
-def fitted_laws(points: Points) -> tuple[CorrelationLaws, dict[str, float]]:
-    """The laws of L′ and of the pairs at contact with the least squares of their logarithms, and
-    the rms of each.
+def fitted_laws(
+    points: Points,
+) -> tuple[CorrelationLaws, dict[str, np.ndarray], dict[str, float]]:
+    """The laws of L′ and of the pairs at contact with the least squares of their logarithms, the
+    standard errors of their coefficients, and the rms of each.
 
     A point counts as much as the area of the plane of ln(1 − α) and ν that it stands for.
     """
-    laws, rms_of, roots = MEASURED_LAWS, {}, np.sqrt(areas(points["alpha"], points["nu"]))
+    laws, stderrs, rms_of = MEASURED_LAWS, {}, {}
+    roots = np.sqrt(areas(points["alpha"], points["nu"]))
     for name in CORRECTIONS:
 
         def weighted(
@@ -316,10 +318,10 @@ def fitted_laws(points: Points) -> tuple[CorrelationLaws, dict[str, float]]:
 
         fit = least_squares(weighted, START[name], x_scale="jac", bounds=(0, np.inf))
         scatter = fit.fun @ fit.fun / (fit.fun.size - fit.x.size)
-        stderr = np.sqrt(np.diag(scatter * np.linalg.inv(fit.jac.T @ fit.jac)))
+        stderrs[name] = np.sqrt(np.diag(scatter * np.linalg.inv(fit.jac.T @ fit.jac)))
         rms_of[name] = rms(fit.fun / roots)
-        laws = replace(laws, **{name: fit.x, f"{name}_stderr": stderr})
-    return laws, rms_of
+        laws = laws._replace(**{name: fit.x})
+    return laws, stderrs, rms_of
 
 
 def areas(alphas: np.ndarray, nus: np.ndarray) -> np.ndarray:
@@ -338,7 +340,7 @@ def law_misfit(
 ) -> np.ndarray:
     """Logarithm of a law over what is measured, with other coefficients where they are given."""
     law, measured = CORRECTIONS[name]
-    laws = laws if coefficients is None else replace(laws, **{name: coefficients})
+    laws = laws if coefficients is None else laws._replace(**{name: coefficients})
     return np.log(np.asarray(law(laws, points["alpha"], points["nu"])) / points[measured])
 
 
@@ -355,17 +357,12 @@ def corrected_theory(points: Points, others: dict[str, Points]) -> dict:
     """The laws, and errors with an inner restitution or packing fraction, or the densest, left out,
     and elsewhere.
     """
-    laws, of_fit = fitted_laws(points)
+    laws, stderrs, of_fit = fitted_laws(points)
     judged = others["judged_on"]
     result: dict = {
         "laws": {
-            **{
-                name: np.asarray(getattr(laws, name)).tolist()
-                for name in ("length", "length_stderr")
-            },
-            **{
-                name: np.asarray(getattr(laws, name)).tolist() for name in ("pairs", "pairs_stderr")
-            },
+            **{name: np.asarray(getattr(laws, name)).tolist() for name in stderrs},
+            **{f"{name}_stderr": stderr.tolist() for name, stderr in stderrs.items()},
             "scatter": [rms(misfits(laws, judged)[name]) for name in PREDICTED],
         },
         "rms_of_fit": of_fit,
@@ -391,9 +388,9 @@ def corrected_theory(points: Points, others: dict[str, Points]) -> dict:
         }
     none = np.zeros(3)
     variants = {
-        "enskog": replace(laws, length=none, pairs=none),
-        "length": replace(laws, pairs=none),
-        "length_and_dense_pairs": replace(laws, pairs=np.asarray(laws.pairs) * [0, 1, 1]),
+        "enskog": laws._replace(length=none, pairs=none),
+        "length": laws._replace(pairs=none),
+        "length_and_dense_pairs": laws._replace(pairs=np.asarray(laws.pairs) * [0, 1, 1]),
         "length_and_pairs": laws,
     }
     for name, some in {"fitted_map": points, **others}.items():
@@ -481,7 +478,7 @@ def draw(points: Points, judged: Points, laws: CorrelationLaws) -> Figure:
         )
         law = np.asarray(correlation_length(laws, np.full_like(dense, alpha), dense))
         left.plot(dense, law, color=style["color"], linestyle="-", linewidth=1)
-    none = replace(laws, length=np.zeros(3), pairs=np.zeros(3))
+    none = laws._replace(length=np.zeros(3), pairs=np.zeros(3))
     for label, applied, face in (("Enskog", none, "none"), ("corrected", laws, "0")):
         ratio = np.exp(misfits(applied, judged)["pressure"])
         shift = 0.004 if face == "none" else -0.004

@@ -26,8 +26,8 @@ from benchmarks.output import RESULTS, Output
 from benchmarks.pages import read
 from benchmarks.peers import chart
 from jaxgran.maps.results import open_map
-from jaxgran.reference.corrected_shear import MEASURED_LAWS
 from jaxgran.reference.table import shipped_table
+from jaxgran.theory.corrected_shear import MEASURED_LAWS
 
 PICTURES: dict[str, Callable[[], Figure]] = {
     "collapse": lambda: collapse.draw(read("collapse")["rows"]),

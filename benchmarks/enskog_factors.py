@@ -28,8 +28,9 @@ import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.environment import usable_cores
 from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, curve_styles, styled
-from jaxgran.sampling.enskog_factors import FACTORS, LENGTHS, RATES, measured_over_enskog
+from jaxgran.sampling.enskog_factors import LENGTHS, RATES, measured_over_enskog
 from jaxgran.sampling.sample import estimates
+from jaxgran.theory.assumptions import ASSUMPTIONS
 
 START = 1e-3  # time step of the steady state, and of all numbers of grains
 RELAXATION = 0.5
@@ -75,7 +76,7 @@ def run(output: Output) -> None:
         done = dict(zip(tasks, pool.map(samples, [plan] * len(tasks), tasks), strict=True))
     print(
         "   α    ν     N      dt  status          force ratio    T local   factors of the "
-        "pressure: " + ", ".join(FACTORS)
+        "pressure: " + ", ".join(ASSUMPTIONS)
     )
     rows = []
     for flow, grains in product(plan.flows, plan.sizes):
@@ -126,7 +127,7 @@ def row(flow: jg.ShearFlow, seeds: list[jg.Sample]) -> dict:
     numbers = {"force_ratio": [value["force_ratio"], error["force_ratio"]]}
     numbers |= {
         name: [value[name], error[name]]
-        for name in (*(f"{rate}_{factor}" for rate in RATES for factor in FACTORS), *LENGTHS)
+        for name in (*(f"{rate}_{factor}" for rate in RATES for factor in ASSUMPTIONS), *LENGTHS)
     }
     return {
         "alpha": flow.restitution,
@@ -141,7 +142,9 @@ def row(flow: jg.ShearFlow, seeds: list[jg.Sample]) -> dict:
 
 def line(row: dict) -> str:
     """A row as it is printed."""
-    factors = "".join("{:8.3f} ± {:.3f}".format(*row[f"pressure_{factor}"]) for factor in FACTORS)
+    factors = "".join(
+        "{:8.3f} ± {:.3f}".format(*row[f"pressure_{factor}"]) for factor in ASSUMPTIONS
+    )
     begin = "{alpha:4g} {nu:4g} {grains:5d} {timestep:7g}  {status:12s}".format(**row)
     warm = row["local_over_granular_temperature"]
     return begin + "{:8.3f} ± {:.3f}".format(*row["force_ratio"]) + f"{warm:8.2f} {factors}"
@@ -153,9 +156,9 @@ def draw(plan: Plan, rows: list[dict]) -> Figure:
     line for each flow.
     """
     figure = Figure(figsize=(TWO_COLUMNS, 8.2), layout="constrained")
-    grid = figure.subplots(len(FACTORS), 2, sharex="col", sharey="row")
+    grid = figure.subplots(len(ASSUMPTIONS), 2, sharex="col", sharey="row")
     sides = (("timestep", "grains", plan.size_of_timesteps), ("grains", "timestep", START))
-    for panels, factor in zip(grid, FACTORS, strict=True):
+    for panels, factor in zip(grid, ASSUMPTIONS, strict=True):
         for axes, (x, fixed, at) in zip(panels, sides, strict=True):
             for flow, style in zip(plan.flows, curve_styles(len(plan.flows)), strict=True):
                 some = [

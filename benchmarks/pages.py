@@ -31,9 +31,9 @@ from jaxgran.maps.results import open_map
 from jaxgran.maps.schema import flattened, shear_stress_ratio
 from jaxgran.model.display import with_error
 from jaxgran.plotting.factors import CURVES, PREFIX, with_temperature
-from jaxgran.reference.table import FACTORS
 from jaxgran.reference.validity import validity
 from jaxgran.sampling.budget import SIZE_LAWS
+from jaxgran.theory.assumptions import ASSUMPTIONS
 
 BUILD = ROOT / "docs" / "_build"
 TEMPLATES = {  # of committed pages
@@ -184,7 +184,7 @@ def product_of(
     ``enskog_factors``, N = 256.
     """
     row = at(rows, alpha=flow[0], nu=flow[1], grains=256, timestep=timestep)
-    return math.prod(row[f"pressure_{name}"][0] for name in FACTORS)
+    return math.prod(row[f"pressure_{name}"][0] for name in ASSUMPTIONS)
 
 
 def ranked(
@@ -241,7 +241,7 @@ ENVIRONMENT.filters |= {
     "date": lambda number: f"{number // 10000}-{number // 100 % 100:02d}-{number % 100:02d}",
 }
 ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table}
-ENVIRONMENT.globals |= {"timestep_verdicts": timestep_error.verdicts}
+ENVIRONMENT.globals |= {"ASSUMPTIONS": ASSUMPTIONS, "timestep_verdicts": timestep_error.verdicts}
 ENVIRONMENT.globals |= {"SOLVER_GROUPS": GROUPS, "FACTOR_CURVES": CURVES, "SIZE_LAWS": SIZE_LAWS}
 ENVIRONMENT.globals |= {
     function.__name__: function

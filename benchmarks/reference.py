@@ -32,11 +32,9 @@ from benchmarks.reference_figure import BINARY, draw
 from benchmarks.reference_map import PLANE, reference_points
 from jaxgran.maps.schema import flattened
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.reference.corrected_shear import corrected_shear
 from jaxgran.reference.surface import Shape, coordinates
 from jaxgran.reference.table import (
     CORRECTED,
-    FACTORS,
     FOLDER,
     LENGTH,
     MEASURED,
@@ -50,6 +48,8 @@ from jaxgran.reference.table import (
     write_columns,
 )
 from jaxgran.sampling.budget import SIZE_LAWS
+from jaxgran.theory.assumptions import ASSUMPTIONS
+from jaxgran.theory.corrected_shear import corrected_shear
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.navier_stokes import garzo_dufty
 
@@ -109,7 +109,7 @@ def make_table(
     paths = {name: name for name in (*MEASURED, RATIO)} | {
         "dissipation_rate": "stresses/dissipation_rate"
     }
-    paths |= {f"pressure_{name}": f"theory/enskog_factor_pressure_{name}" for name in FACTORS}
+    paths |= {f"pressure_{name}": f"theory/enskog_factor_pressure_{name}" for name in ASSUMPTIONS}
     paths[LENGTH] = f"theory/{LENGTH}"
     for name, path in paths.items():
         columns |= {name: flat[path].values, f"{name}_stderr": flat[f"{path}_stderr"].values}
@@ -283,8 +283,7 @@ def whole_errors(table: Table) -> dict[str, Any]:
     """
     nus, result = table.columns["packing_fraction"], {}
     for name in (*AVERAGES, "dissipation_rate"):
-        _, stderr = table.surfaces[name](table.points)
-        half = np.hypot(HALF_INTERVAL * stderr, np.exp(table.bounds[name](table.points)[0]))
+        _, half = table.log_estimate(name, table.points)
         result[name] = {
             "median": round(float(np.median(half)), 4),
             "within_3_percent": round(float(np.mean(half < 0.03)), 3),
@@ -366,8 +365,7 @@ def plane(table: Table) -> dict[str, Any]:
         np.linspace(*table.range("packing_fraction"), 200),
     )
     where = coordinates(*np.meshgrid(1 - np.exp(x), y))
-    over, stderr = table.surfaces["pressure"](where)
-    half = np.hypot(HALF_INTERVAL * stderr, np.exp(table.bounds["pressure"](where)[0]))
+    over, half = table.log_estimate("pressure", where)
     points = coordinates(alphas, nus)
     error = np.exp(table.series(points)["pressure"]) / table.columns["pressure"] - 1
     worst = int(np.argmin(np.where(table.columns[RATIO] < 1 + BINARY, error, np.inf)))

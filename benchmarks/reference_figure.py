@@ -8,7 +8,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.plotting.style import (
     ALPHA_LABEL,
     INTERVAL_COLOUR,
@@ -19,7 +18,7 @@ from jaxgran.plotting.style import (
     styled,
 )
 from jaxgran.reference.surface import coordinates
-from jaxgran.reference.table import Table, excess_from_surface
+from jaxgran.reference.table import RATIO, Table, excess_from_surface
 
 LEVELS = (-0.5, -0.25, -0.1, -0.05, 0.05, 0.1, 0.25, 0.5)
 LABELLED = {-0.5: 0.05, -0.25: 0.03, -0.1: 0.04, -0.05: 0.026}  # 1 − α of the label of a level
@@ -40,9 +39,14 @@ def draw(table: Table) -> Figure:
     axes = figure.add_subplot(xscale="log", xlabel=ALPHA_LABEL, ylabel=NU_LABEL)
     axes.set(xlim=(x.min(), x.max()), ylim=(y.min(), y.max()))
     _draw_errors(axes, table, x, y, where)
+    ratios = {float(table.head["timestep"]): table.surfaces[RATIO]} | {
+        float(name.split("_at_")[1]): surface
+        for name, surface in table.surfaces.items()
+        if name.startswith(f"{RATIO}_at_")
+    }
+    timesteps = sorted(ratios)
     coarse, middle, fine = (
-        np.maximum(excess_from_surface(table.ratios[dt](where)[0]), 1e-9)
-        for dt in sorted(table.ratios)[::-1]
+        np.maximum(excess_from_surface(ratios[dt](where)[0]), 1e-9) for dt in timesteps[::-1]
     )
     axes.contour(x, y, middle, [BINARY], colors=GREEN, linewidths=2, zorder=4)
     fan = np.maximum(np.log(BINARY / coarse), np.log(fine / BINARY))
@@ -50,7 +54,7 @@ def draw(table: Table) -> Figure:
     axes.set_xticks(TICKS, [f"{tick:g}" for tick in TICKS])
     axes.minorticks_off()
     axes.set_title(r"nearly elastic $\longleftarrow\qquad\longrightarrow$ dissipative")
-    first, between, last = (rf"10^{{{round(np.log10(dt))}}}" for dt in sorted(table.ratios))
+    first, between, last = (rf"10^{{{round(np.log10(dt))}}}" for dt in timesteps)
     handles = [
         Patch(facecolor="0.88", label="theory within 10 %"),
         Line2D([], [], color="black", linewidth=0.9, label="error of the pressure"),
@@ -66,8 +70,7 @@ def draw(table: Table) -> Figure:
 
 def _draw_errors(axes: Axes, table: Table, x: np.ndarray, y: np.ndarray, where: np.ndarray) -> None:
     """Contours of the error of the pressure, and where each of them may lie."""
-    over, stderr = table.surfaces["pressure"](where)
-    half = np.hypot(HALF_INTERVAL * stderr, np.exp(table.bounds["pressure"](where)[0]))
+    over, half = table.log_estimate("pressure", where)
     error = np.expm1(-over)
     axes.contourf(x, y, abs(error), [0, RIGHT], colors=["0.88"], zorder=0)
     apart = np.min([np.abs(np.log1p(level) + over) for level in LEVELS], axis=0)

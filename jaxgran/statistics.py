@@ -1,9 +1,7 @@
-"""Standard errors of estimates from block sums, error correlations, statistical inefficiency, drift
-of a series.
+"""Standard errors of estimates from block sums, statistical inefficiency, drift of a series.
 
 ``standard_errors`` infers the correlation time from the blocks themselves; its intervals have the
-stated coverage when each seed is several correlation times long. ``jackknife`` assumes that merged
-blocks are independent, and underestimates errors when few merged blocks are.
+stated coverage when each seed is several correlation times long.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,10 +12,6 @@ import jax
 import numpy as np
 import scipy  # its parts are loaded when they are used
 
-# Blocks per group; with 32 blocks per seed, the last compares whole seeds
-BLOCK_MERGES = (1, 2, 4, 8, 16, 32)
-# The spread over fewer groups is too uncertain; single blocks are used in any case
-_FEWEST_GROUPS = 4
 _MOST_BLOCKS = 32  # per seed in ``standard_errors``; more are merged
 _TIMES = np.geomspace(0.2, 100, 16)  # correlation times, in blocks
 _WHITE_SHARES = np.array([0.0, 0.5, 0.9])  # share of white noise in the variance of a block
@@ -109,43 +103,6 @@ def merged_blocks(lengths: np.ndarray | None, seeds: int, blocks: int) -> np.nda
     return np.maximum(1, blocks // np.maximum(1, merge)).astype(int)
 
 
-def jackknife(
-    estimate: Callable[[Any], Mapping[str, Any]], sums: Any
-) -> tuple[Estimates, Estimates]:
-    """Estimates from the sums over all blocks of all seeds, and their standard errors.
-
-    An estimate is a function of sums, usually a ratio. Its error comes from leaving out one group
-    of blocks at a time. Successive blocks are correlated, larger groups less so: the error returned
-    is the largest over group sizes up to 32 that leave at least four groups (the blocking method:
-    Flyvbjerg and Petersen, J. Chem. Phys. 91, 461, 1989).
-
-    Args:
-      estimate: maps a pytree of sums with any leading axes to estimates by name with the same
-        leading axes.
-      sums: pytree of arrays of shape (seeds, blocks, ...), in any units.
-
-    Returns:
-      Estimates and standard errors, without the axes of seeds and blocks. The error is NaN for
-      fewer than two blocks.
-
-    Examples:
-      Eight blocks with a trend. Independent blocks would have an error of 0.87; pairs of blocks
-      have a larger one.
-
-      >>> blocks = {"x": np.arange(1.0, 9.0)[None], "steps": np.ones((1, 8))}
-      >>> value, error = jackknife(lambda sums: {"mean": sums["x"] / sums["steps"]}, blocks)
-      >>> float(value["mean"]), round(float(error["mean"]), 2)
-      (4.5, 1.29)
-    """
-    seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
-    merges = [m for m in BLOCK_MERGES if seeds * (blocks // m) >= (2 if m == 1 else _FEWEST_GROUPS)]
-    edges = np.cumsum([1, *(seeds * (blocks // m) for m in merges)])
-    flat, by_name = _flat(estimate(jax.tree.map(lambda x: _whole_and_parts(x, merges), sums)))
-    spreads = [_spread(part) for part in np.split(flat, edges)[1:-1]]
-    unknown = np.full_like(flat[0], np.nan)
-    return by_name(flat[0]), by_name(np.fmax.reduce([unknown, *spreads]))
-
-
 def correlation_length(
     estimate: Callable[[Any], Mapping[str, Any]], sums: Any, lengths: np.ndarray | None = None
 ) -> Estimates:
@@ -165,10 +122,9 @@ def correlation_length(
       g of each estimate, in blocks of ``merged_blocks``; NaN for fewer than four blocks in the
       longest seed.
     """
-    seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
-    counts = merged_blocks(lengths, seeds, blocks)
-    flat, by_name = _flat(estimate(jax.tree.map(lambda x: _all_but_one(_joined(x, counts)), sums)))
-    return by_name(_inefficiency(np.split(flat, np.cumsum(counts)[:-1])))
+    blocks = jax.tree.leaves(sums)[0].shape[1]
+    _, influence, scale, by_name = _influences(estimate, sums, lengths, blocks)
+    return by_name(np.where(scale > 0, _inefficiency(influence), np.nan))
 
 
 def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, float]:
@@ -192,17 +148,20 @@ def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, fl
 
 
 def _influences(
-    estimate: Callable[[Any], Mapping[str, Any]], sums: Any, lengths: np.ndarray | None
+    estimate: Callable[[Any], Mapping[str, Any]],
+    sums: Any,
+    lengths: np.ndarray | None,
+    most: int = _MOST_BLOCKS,
 ) -> tuple[np.ndarray, list[np.ndarray], np.ndarray, Callable[[np.ndarray], Estimates]]:
     """Estimates (n,), influences of the blocks of each seed (blocks, n), their scale, and
     ``by_name``.
 
     The influence of a block is (B - 1) times the mean of the leave-one-out estimates minus the one
     without the block, for B blocks in all, divided by the scale (its root mean square, zero for
-    rounding only). A seed has at most ``_MOST_BLOCKS`` blocks.
+    rounding only). A seed has at most ``most`` blocks.
     """
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
-    counts = merged_blocks(lengths, seeds, min(blocks, _MOST_BLOCKS))
+    counts = merged_blocks(lengths, seeds, min(blocks, most))
     total = int(counts.sum())
 
     def whole_and_parts(x: np.ndarray) -> np.ndarray:
@@ -301,26 +260,9 @@ def _half_width(
     return half
 
 
-def _whole_and_parts(x: np.ndarray, merges: list[int]) -> np.ndarray:
-    """The sum over all blocks, then for each merge the leave-one-out sums of the whole groups, (1 +
-    groups + groups + ..., ...).
-    """
-    seeds, blocks = x.shape[:2]
-    counts = [(merge, blocks // merge) for merge in merges]
-    grouped = [
-        x[:, : n * merge].reshape(seeds * n, merge, *x.shape[2:]).sum(axis=1) for merge, n in counts
-    ]
-    return np.concatenate([x.sum(axis=(0, 1))[None], *map(_all_but_one, grouped)])
-
-
 def _all_but_one(groups: np.ndarray) -> np.ndarray:
     """Leave-one-out sums, (groups, ...)."""
     return groups.sum(axis=0) - groups
-
-
-def _spread(without: np.ndarray) -> np.ndarray:
-    """Jackknife standard errors (n,) from the leave-one-out estimates (groups, n)."""
-    return np.sqrt((len(without) - 1) * np.mean((without - without.mean(axis=0)) ** 2, axis=0))
 
 
 def _flat(estimates: Mapping[str, Any]) -> tuple[np.ndarray, Callable[[np.ndarray], Estimates]]:
@@ -339,20 +281,16 @@ def _flat(estimates: Mapping[str, Any]) -> tuple[np.ndarray, Callable[[np.ndarra
 
 
 def _inefficiency(seeds: Sequence[np.ndarray]) -> np.ndarray:
-    """Statistical inefficiency (n,) of n series (blocks, n), one a seed."""
+    """Statistical inefficiency (n,) of n series (blocks, n) of plain mean zero, one a seed."""
     blocks = max(map(len, seeds))
     if blocks < 4:
         return np.full(seeds[0].shape[1], np.nan)
-    mean = np.concatenate(seeds).mean(axis=0)
-    deviations = [seed - mean for seed in seeds]
     products = [
-        np.concatenate([x[: len(x) - k] * x[k:] for x in deviations if len(x) > k]).mean(axis=0)
+        np.concatenate([x[: len(x) - k] * x[k:] for x in seeds if len(x) > k]).mean(axis=0)
         for k in range(blocks // 2)
     ]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        correlation = np.stack(products) / products[0]
-    weighted = correlation * (1 - np.arange(len(products)) / blocks)[:, None]
-    pairs = weighted[: len(weighted) // 2 * 2].reshape(-1, 2, *weighted.shape[1:]).sum(axis=1)
+    weights = 1 - np.arange(len(products)) / blocks
+    weighted = np.stack(products) / products[0] * weights[:, None]
+    pairs = weighted[: len(weighted) // 2 * 2].reshape(-1, 2, weighted.shape[1]).sum(axis=1)
     counted = np.logical_and.accumulate(pairs > 0, axis=0)
-    length = 2 * np.sum(np.where(counted, pairs, 0), axis=0) - 1
-    return np.where(np.isfinite(products[0]) & (products[0] > 0), np.maximum(length, 1), np.nan)
+    return np.maximum(2 * np.sum(np.where(counted, pairs, 0), axis=0) - 1, 1)

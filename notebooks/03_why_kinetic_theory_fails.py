@@ -29,7 +29,7 @@ import numpy as np
 
 import jaxgran as jg
 from jaxgran.model.display import with_error
-from jaxgran.reference.corrected_shear import MEASURED_LAWS, corrected_shear, correlation_length
+from jaxgran.theory.corrected_shear import MEASURED_LAWS, corrected_shear, correlation_length
 
 jax.config.update("jax_enable_x64", True)
 jg.use_cache()

@@ -3,7 +3,6 @@ flows.
 """
 
 import json
-from dataclasses import replace
 from functools import cache
 
 import jax
@@ -12,12 +11,17 @@ import numpy as np
 import pytest
 
 from benchmarks.output import RESULTS
-from jaxgran.reference.corrected_shear import MEASURED_LAWS, CorrectedShear, corrected_shear
 from jaxgran.sampling.timestep import JAMMING
+from jaxgran.theory.corrected_shear import (
+    MEASURED_LAWS,
+    SCATTER,
+    CorrectedShear,
+    corrected_shear,
+)
 from jaxgran.theory.enskog import collisional_transfer
 from jaxgran.theory.gaussian_moments import gaussian_moments
 
-ENSKOG = replace(MEASURED_LAWS, length=np.zeros(3), pairs=np.zeros(3))
+ENSKOG = MEASURED_LAWS._replace(length=np.zeros(3), pairs=np.zeros(3))
 PLANE = [
     axis.ravel()
     for axis in np.meshgrid([0.0, 0.1, 0.3, 0.6, 0.9, 0.99], [0.01, 0.1, 0.4, 0.7, 0.83])
@@ -129,16 +133,10 @@ def result() -> dict:
 
 def test_the_coefficients_are_those_of_the_benchmark() -> None:
     laws = result()["corrected_theory"]["laws"]
-    for name in ("length", "length_stderr", "pairs", "pairs_stderr", "scatter"):
+    for name in ("length", "pairs"):
         np.testing.assert_allclose(getattr(MEASURED_LAWS, name), laws[name], rtol=1e-3)
+    np.testing.assert_allclose(SCATTER, laws["scatter"], rtol=1e-3)
     assert MEASURED_LAWS.jamming_fraction == JAMMING
-    for words, of in ((MEASURED_LAWS.fitted_to, "map"), (MEASURED_LAWS.judged_on, "judged_on")):
-        about = result()[of]
-        digits = f"{about['timestep']:.0e}".replace("e-0", "e-")
-        sizes = " to ".join(
-            str(size) for size in sorted({about["fewest_grains"], about["most_grains"]})
-        )
-        assert words == f"{about['points']} flows of N = {sizes}, dt = {digits}"
 
 
 def predicted_over_measured(points: list[dict], predicted: CorrectedShear) -> np.ndarray:
@@ -162,8 +160,6 @@ def test_errors_at_flows_that_were_not_fitted_have_the_size_that_is_quoted() -> 
     assert not {point["nu"] for point in result()["points"]} & set(nu)
     errors = predicted_over_measured(points, batched()(alpha, nu))
     scatter = np.sqrt(np.mean(errors**2, axis=1))
-    np.testing.assert_allclose(
-        scatter, MEASURED_LAWS.scatter, rtol=5e-3
-    )  # results are rounded to four digits
+    np.testing.assert_allclose(scatter, SCATTER, rtol=5e-3)  # results are rounded to four digits
     plain = predicted_over_measured(points, batched(laws_are_zero=True)(alpha, nu))
     assert np.all(scatter < np.sqrt(np.mean(plain**2, axis=1)) / 2)

@@ -19,9 +19,10 @@ from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.variables import NOT_RUN, PREDICTED
 from jaxgran.model.status import Status
 from jaxgran.sampling.budget import large_system, size_error
-from jaxgran.sampling.enskog_factors import FACTORS, LENGTHS, measured_over_enskog
+from jaxgran.sampling.enskog_factors import LENGTHS, measured_over_enskog
 from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.sample import BLOCKS
+from jaxgran.theory.assumptions import ASSUMPTIONS
 from jaxgran.theory.gaussian_moments import gaussian_moments
 
 ALPHAS, NUS, SEEDS = (0.5, 0.9), (0.5, 0.6), 3
@@ -130,7 +131,7 @@ def test_factors_and_lengths_are_those_of_the_samples_of_a_point(settings, data,
     samples = [results[0, seed].sample for seed in range(SEEDS)]
     value, error = measured_over_enskog(settings.flows[settings.points[0]], samples)
     point = data["theory"].sel(packing_fraction=NUS[0], restitution=ALPHAS[0])
-    stored = {f"enskog_factor_pressure_{factor}": f"pressure_{factor}" for factor in FACTORS}
+    stored = {f"enskog_factor_pressure_{factor}": f"pressure_{factor}" for factor in ASSUMPTIONS}
     stored |= {name: name for name in (*LENGTHS, "enskog_pressure")}
     assert set(stored.values()) <= set(value)
     for path, name in stored.items():

@@ -57,7 +57,7 @@ def test_answers_of_the_reference_map_are_shown_in_one_line() -> None:
     law, verdict = jg.constitutive_law(), jg.validity(0.6, [0.5, 0.65])
     assert repr(law) == "ConstitutiveLaw(restitution=0.05 to 0.98, packing_fraction=0.1 to 0.83)"
     answer = law(0.6, 0.65)
-    assert f"pressure={with_error(answer.pressure, answer.pressure_ci95)}, " in repr(answer)
+    assert f"pressure={with_error(*answer.pressure)}, " in repr(answer)
     for value in (answer, law(0.6, [0.5, 0.65]), verdict, verdict.at(0)):
         assert repr(value).startswith(type(value).__name__) and "ci95" not in repr(value)
         assert len(repr(value)) < 400 and "\n" not in repr(value)

@@ -13,8 +13,9 @@ from synthetic import sample_of_tally
 import jaxgran as jg
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.tally import Tally, empty_tally
-from jaxgran.sampling.enskog_factors import FACTORS, RATES, measured_over_enskog
+from jaxgran.sampling.enskog_factors import RATES, measured_over_enskog
 from jaxgran.sampling.sample import BLOCKS, Sample, estimates
+from jaxgran.theory.assumptions import ASSUMPTIONS
 from jaxgran.theory.enskog import collisional_transfer
 from jaxgran.theory.steady_shear import contact_value
 
@@ -94,7 +95,7 @@ def test_factors_times_enskog_are_what_is_measured(engines, flowing, packing_fra
     value, error = measured_over_enskog(flow_of(packing_fraction), [sample])
     measured = measured_rates(sample)
     for rate in RATES:
-        factors = [value[f"{rate}_{factor}"] for factor in FACTORS]
+        factors = [value[f"{rate}_{factor}"] for factor in ASSUMPTIONS]
         assert np.prod(factors) * value[f"enskog_{rate}"] == pytest.approx(
             measured[rate], rel=1e-12
         )
@@ -154,7 +155,7 @@ def test_a_change_of_collisions_is_found_in_its_own_factor(
         measured_over_enskog(FLOW, [chaotic_sample(2, **{made: x})])[0] for x in (1.0, times)
     )
     for rate in RATES:
-        for factor in FACTORS:
+        for factor in ASSUMPTIONS:
             change = failing[f"{rate}_{factor}"] / chaotic[f"{rate}_{factor}"]
             found_in = expected.get(f"{rate}_{factor}", expected.get(factor, 1.0))
             assert change == pytest.approx(found_in, rel=1e-9), (rate, factor)
@@ -164,7 +165,10 @@ def test_long_waves_change_the_granular_temperature_alone() -> None:
     calm, waving = (measured_over_enskog(FLOW, [chaotic_sample(2, waves=x)])[0] for x in (1.0, 2.0))
     lengths = ("correlation_length", "correlation_length_from_pressure")
     kept = [
-        f"{rate}_{factor}" for rate in RATES for factor in FACTORS if factor != "local_temperature"
+        f"{rate}_{factor}"
+        for rate in RATES
+        for factor in ASSUMPTIONS
+        if factor != "local_temperature"
     ]
     for name in (*kept, *lengths):
         assert waving[name] == pytest.approx(calm[name], rel=1e-9), name

@@ -12,7 +12,7 @@ import jaxgran as jg
 from jaxgran.maps.ratio_map import ratio_map
 from jaxgran.maps.start import combined
 from jaxgran.model.checks import InputError
-from jaxgran.sampling.enskog_factors import FACTORS
+from jaxgran.theory.assumptions import ASSUMPTIONS
 from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
 
 MAP: dict[str, Any] = {
@@ -53,7 +53,7 @@ def test_theory_is_that_of_the_mixture(bidisperse: xr.DataTree) -> None:
     there = bidisperse["theory"]
     for name in ("granular_temperature", "pressure", "shear_stress", "collision_rate"):
         np.testing.assert_allclose(there[name].item(), getattr(theory, name), rtol=1e-6)
-    factors = [there[f"enskog_factor_pressure_{factor}"].item() for factor in FACTORS]
+    factors = [there[f"enskog_factor_pressure_{factor}"].item() for factor in ASSUMPTIONS]
     contact = np.trace(bidisperse["stresses/contact_stress"].values.reshape(2, 2)) / 2
     assert np.prod(factors) * there["enskog_pressure"].item() == pytest.approx(contact, rel=1e-9)
 

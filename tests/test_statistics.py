@@ -8,22 +8,13 @@ from scipy.special import stdtrit
 
 from jaxgran import statistics
 from jaxgran.model.flow import steps_of_blocks
-from jaxgran.statistics import (
-    correlation_length,
-    drift,
-    jackknife,
-    standard_errors,
-)
+from jaxgran.statistics import correlation_length, drift, standard_errors
 
 TRIALS = 400
 
 
 def ratio(sums: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {"ratio": sums["over"] / sums["under"]}
-
-
-def error_of_ratio(sums: dict[str, np.ndarray]) -> float:
-    return float(jackknife(ratio, sums)[1]["ratio"])
 
 
 def correlated_blocks(rng: np.random.Generator, seeds: int, blocks: int) -> dict[str, np.ndarray]:
@@ -40,62 +31,6 @@ def ar1(rng: np.random.Generator, shape: tuple[int, int], correlation: float) ->
     for k in range(1, shape[1]):
         series[:, k] = correlation * series[:, k - 1] + np.sqrt(1 - correlation**2) * noise[:, k]
     return series
-
-
-def test_error_of_a_mean_is_the_textbook_one(monkeypatch) -> None:
-    monkeypatch.setattr(statistics, "BLOCK_MERGES", (1,))
-    over = np.random.default_rng(0).normal(size=(3, 8))
-    value, error = jackknife(ratio, {"over": over, "under": np.ones((3, 8))})
-    np.testing.assert_allclose(value["ratio"], over.mean(), rtol=1e-13)
-    np.testing.assert_allclose(error["ratio"], over.std(ddof=1) / np.sqrt(over.size), rtol=1e-12)
-
-
-@pytest.mark.parametrize("merge", statistics.BLOCK_MERGES)
-def test_error_of_a_ratio_of_sums_is_that_of_the_delta_method(merge: int, monkeypatch) -> None:
-    # Var R = Var(x − R y) / (n ⟨y⟩²); here x − R y has the standard deviation 2, and ⟨y⟩ = 10.
-    monkeypatch.setattr(statistics, "BLOCK_MERGES", (merge,))
-    rng, seeds, blocks = np.random.default_rng(1), 4, 32
-    variances = np.array(
-        [error_of_ratio(correlated_blocks(rng, seeds, blocks)) ** 2 for _ in range(TRIALS)]
-    )
-    expected = 2.0**2 / (seeds * blocks * 10.0**2)
-    assert (
-        abs(variances.mean() - expected) < 4 * variances.std() / np.sqrt(TRIALS) + 0.01 * expected
-    )
-
-
-def test_merging_correlated_blocks_enlarges_the_error_as_much_as_their_correlation_asks(
-    monkeypatch,
-) -> None:
-    # A mean of four values of an AR(1) process with ρ = ½ has (4 + 6ρ + 4ρ² + 2ρ³)/4 times the
-    # variance of white noise.
-    rng = np.random.default_rng(3)
-    series = ar1(rng, (TRIALS, 64), 0.5)[:, None, :]
-    mean_variance = {}
-    for merge in (1, 4):
-        monkeypatch.setattr(statistics, "BLOCK_MERGES", (merge,))
-        variances = [error_of_ratio({"over": x, "under": np.ones_like(x)}) ** 2 for x in series]
-        mean_variance[merge] = np.mean(variances)
-    expected = (4 + 6 * 0.5 + 4 * 0.25 + 2 * 0.125) / 4
-    assert mean_variance[4] / mean_variance[1] == pytest.approx(
-        expected, rel=0.1
-    )  # 4 % standard error
-
-
-def test_merged_blocks_never_span_two_seeds(monkeypatch) -> None:
-    monkeypatch.setattr(statistics, "BLOCK_MERGES", (2,))
-    over = np.random.default_rng(5).normal(size=(2, 5))
-    error = error_of_ratio({"over": over, "under": np.ones_like(over)})
-    pairs = (over[:, 0:4:2] + over[:, 1:4:2]).ravel() / 2
-    assert error == pytest.approx(pairs.std(ddof=1) / np.sqrt(4), rel=1e-12)
-
-
-@pytest.mark.parametrize(("seeds", "known"), [(1, False), (2, True)])
-def test_a_single_block_has_no_error(seeds: int, known: bool) -> None:
-    over = np.random.default_rng(6).normal(size=(seeds, 1))
-    value, error = jackknife(ratio, {"over": over, "under": np.ones_like(over)})
-    assert value["ratio"] == pytest.approx(over.mean())
-    assert np.isfinite(error["ratio"]) == known
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.6, 0.8])
@@ -299,16 +234,6 @@ def test_length_of_a_constant_or_of_too_few_blocks_is_unknown() -> None:
     assert np.isnan(correlation_length(ratio, {"over": ones, "under": ones})["ratio"])
     few = np.random.default_rng(8).normal(size=(2, 3))
     assert np.isnan(correlation_length(ratio, {"over": few, "under": few})["ratio"])
-
-
-def test_largest_error_of_all_merges_is_taken(monkeypatch) -> None:
-    sums = correlated_blocks(np.random.default_rng(4), 1, 16)
-    all_merges = error_of_ratio(sums)
-    single = []
-    for merge in (1, 2, 4):
-        monkeypatch.setattr(statistics, "BLOCK_MERGES", (merge,))
-        single.append(error_of_ratio(sums))
-    assert all_merges == max(single)
 
 
 def test_error_of_a_drift_of_four_values_takes_two_means_from_them() -> None:

@@ -20,10 +20,12 @@ from hypothesis import strategies as st
 import jaxgran as jg
 from benchmarks import reference
 from jaxgran.cli.output import in_brackets
+from jaxgran.reference.evaluation import Estimate
 from jaxgran.reference.surface import Shape, Surface
-from jaxgran.reference.table import FACTORS, MEASURED, shipped_table
+from jaxgran.reference.table import MEASURED, shipped_table
 from jaxgran.reference.validity import Validity
 from jaxgran.theory import gaussian_moments, navier_stokes
+from jaxgran.theory.assumptions import ASSUMPTIONS
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 ALPHAS, NUS = st.floats(0.1, 0.98), st.floats(0.1, 0.82)
@@ -84,12 +86,10 @@ def test_error_is_theory_over_measured_and_intervals_are_positive(alpha: float, 
     answer = jg.validity(alpha, nu)
     for name, error in answer.error.items():
         theory = answer.theory[name.removeprefix("local_")]
-        assert 1 + error == pytest.approx(theory / answer.measured[name])
+        assert 1 + error.value == pytest.approx(theory / answer.measured[name].value)
     assert answer.theory["dissipation_rate"] == answer.theory["shear_stress"]
-    assert all(
-        np.all(x > 0)
-        for x in jax.tree.leaves((answer.measured_ci95, answer.error_ci95, answer.factors_ci95))
-    )
+    for estimates in (answer.measured, answer.error, answer.factors):
+        assert all(estimate.ci95 > 0 for estimate in estimates.values())
 
 
 def test_the_table_is_met_at_its_points_within_their_intervals() -> None:
@@ -97,8 +97,9 @@ def test_the_table_is_met_at_its_points_within_their_intervals() -> None:
     flows = table.columns["restitution"], table.columns["packing_fraction"]
     answer = jg.validity(*flows)
     for name in (*MEASURED, "force_ratio"):
-        apart = np.abs(answer.measured[name] - table.columns[name])
-        own = np.hypot(answer.measured_ci95[name], 1.96 * table.columns[f"{name}_stderr"])
+        value, ci95 = answer.measured[name]
+        apart = np.abs(value - table.columns[name])
+        own = np.hypot(ci95, 1.96 * table.columns[f"{name}_stderr"])
         assert np.mean(apart < own) > 0.95
 
 
@@ -121,7 +122,7 @@ def test_every_average_of_the_table_has_its_error() -> None:
 def test_arrays_broadcast_and_jit_vmap_give_the_same_numbers() -> None:
     alphas, nus = np.array([0.2, 0.5, 0.9]), np.array([[0.3], [0.7]])
     answer = jg.validity(alphas, nus)
-    assert answer.measured["pressure"].shape == answer.verdict().shape == (2, 3)
+    assert answer.measured["pressure"].value.shape == answer.verdict().shape == (2, 3)
     compiled = jax.jit(jg.validity)(alphas, nus)
     mapped = jax.vmap(
         lambda nu: jax.vmap(lambda alpha: jg.validity(alpha, nu))(jnp.asarray(alphas))
@@ -138,7 +139,7 @@ def test_arrays_broadcast_and_jit_vmap_give_the_same_numbers() -> None:
 )
 def test_gradients_are_those_of_finite_differences(name: str) -> None:
     def of(x):
-        return jg.validity(x[0], x[1]).measured[name]
+        return jg.validity(x[0], x[1]).measured[name].value
 
     at, step = jnp.array([0.45, 0.71]), 1e-4
     exact = jax.grad(of)(at)
@@ -153,14 +154,14 @@ def test_outside_the_range_is_refused_or_nan_where_jax_traces_it() -> None:
         jg.InputError, match=r"packing_fraction must be between 0.1 and 0.83, the range"
     ):
         jg.validity(0.5, [0.5, 0.84])
-    end = jg.validity(np.float32(0.98), 0.5).measured["pressure"]  # which is 0.98000001907
-    assert end == jg.validity(0.98, 0.5).measured["pressure"]
+    end = jg.validity(np.float32(0.98), 0.5).measured["pressure"].value  # which is 0.98000001907
+    assert end == jg.validity(0.98, 0.5).measured["pressure"].value
     for wrong in ("a", None, np.nan, []):
         with pytest.raises(jg.InputError, match="restitution must be between"):
             jg.validity(wrong, 0.5)
-    values = jax.jit(jg.validity)(jnp.array([0.04, 0.5]), 0.5).measured["pressure"]
+    values = jax.jit(jg.validity)(jnp.array([0.04, 0.5]), 0.5).measured["pressure"].value
     assert list(np.isnan(values)) == [True, False]
-    slopes = jax.grad(lambda x: jnp.nansum(jg.validity(x, 0.5).measured["pressure"]))(
+    slopes = jax.grad(lambda x: jnp.nansum(jg.validity(x, 0.5).measured["pressure"].value))(
         jnp.array([0.04, 0.5])
     )
     assert np.all(np.isfinite(slopes))
@@ -174,17 +175,13 @@ def test_single_precision_is_refused_where_jax_traces() -> None:
 def made(
     error: float, ci95: float, ratio: float = 1.0, of_temperature: float = -0.1, **factors: float
 ) -> Validity:
-    all_factors = dict.fromkeys(FACTORS, np.array(1.0)) | {
-        name: np.array(x) for name, x in factors.items()
+    errors = {
+        "pressure": Estimate(error, ci95),
+        "local_granular_temperature": Estimate(of_temperature, 0.03),
     }
-    measured = {"force_ratio": np.array(ratio)}, {"force_ratio": np.array(0.001)}
-    errors = [
-        {"pressure": np.array(x), "local_granular_temperature": np.array(y)}
-        for x, y in ((error, of_temperature), (ci95, 0.03))
-    ]
-    return Validity(
-        np.array(0.5), np.array(0.5), *measured, {}, *errors, {}, {}, {}, all_factors, {}
-    )
+    all_factors = {name: Estimate(factors.get(name, 1.0), np.nan) for name in ASSUMPTIONS}
+    ratios = {"force_ratio": Estimate(ratio, 0.001)}
+    return Validity(0.5, 0.5, ratios, {}, errors, {}, {}, all_factors)
 
 
 @pytest.mark.parametrize(
@@ -247,8 +244,8 @@ def test_the_command_prints_the_numbers_of_python_without_loading_jax(tmp_path: 
     printed, answer = json.loads(done.stdout), jg.validity(0.7, 0.6)
     assert printed["verdict"]["value"] == answer.verdict()
     for name in MEASURED:
-        assert printed[name]["value"] == pytest.approx(float(answer.measured[name]))
-        ci95 = float(answer.measured_ci95[name])
+        value, ci95 = answer.measured[name]
+        assert printed[name]["value"] == pytest.approx(value)
         assert printed[name]["ci95"] == pytest.approx(ci95, rel=VARIANCE_ROUNDING)
 
 
@@ -265,17 +262,16 @@ PLANE = ("--restitution", "0.2,0.5", "--packing-fraction", "0.5:0.7:3")
 def test_the_command_answers_for_every_pair_of_two_lists(tmp_path: Path) -> None:
     flows = jg.validity(*np.meshgrid([0.2, 0.5], [0.5, 0.6, 0.7]))
     table = jaxgran(tmp_path, "where", *PLANE, "--factors").out
-    for name, of in (("pressure", flows.measured), ("chaos", flows.factors)):
-        half = {"pressure": flows.measured_ci95, "chaos": flows.factors_ci95}[name][name]
-        for value, ci95 in zip(of[name].flat, half.flat, strict=True):
+    for estimate in (flows.measured["pressure"], flows.factors["chaos"]):
+        for value, ci95 in zip(estimate.value.flat, estimate.ci95.flat, strict=True):
             assert in_brackets(value, ci95) in table
     printed = json.loads(jaxgran(tmp_path, "where", *PLANE, "--json").out)
     assert printed["packing_fraction"]["value"] == [0.5, 0.6, 0.7]
-    np.testing.assert_array_equal(printed["error/pressure"]["value"], flows.error["pressure"])
+    np.testing.assert_array_equal(printed["error/pressure"]["value"], flows.error["pressure"].value)
     lines = list(csv.DictReader(jaxgran(tmp_path, "where", *PLANE, "--csv").out.splitlines()))
     assert [line["verdict"] for line in lines] == [*flows.verdict().flat]
     np.testing.assert_array_equal(
-        [float(line["factor/chaos_ci95"]) for line in lines], flows.factors_ci95["chaos"].ravel()
+        [float(line["factor/chaos_ci95"]) for line in lines], flows.factors["chaos"].ci95.ravel()
     )
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxgran.statistics import jackknife
+from jaxgran.statistics import standard_errors
 
 SAFETY = 1.2  # factor by which the fastest disc may become faster between two looks at it
 
@@ -82,7 +82,7 @@ def averages(runs: Sequence[Sequence[Stress]]) -> dict[str, tuple[float, float]]
         for name in Stress._fields
     }
     blocks["count"] = np.ones((len(runs), len(runs[0])))
-    value, error = jackknife(
+    value, error = standard_errors(
         lambda sums: {name: sums[name] / sums["count"] for name in Stress._fields}, blocks
     )
     known = [name for name in Stress._fields if np.isfinite(value[name])]

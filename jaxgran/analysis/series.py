@@ -1,8 +1,4 @@
-"""Averages over a series of snapshots on the host, with standard errors.
-
-Errors come from the jackknife over blocks of times, since successive times are correlated
-(``statistics``).
-"""
+"""Averages over a series of snapshots on the host, with the errors of ``statistics``."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -11,11 +7,9 @@ import jax
 import numpy as np
 
 from jaxgran.dynamics.snapshot import Snapshot
-from jaxgran.statistics import jackknife
+from jaxgran.statistics import standard_errors
 
 Sums = Mapping[str, Any]  # NumPy arrays or scalars by name
-
-BLOCKS = 32  # of successive times, for the standard errors
 
 
 class Measured(NamedTuple):
@@ -38,19 +32,14 @@ def series(snapshots: Snapshot) -> Any:
 def with_errors(
     estimate: Callable[[Sums], Sums], sums: Mapping[str, np.ndarray]
 ) -> dict[str, Measured]:
-    """Estimates from sums of shape (times, ...) and their standard errors by the jackknife over
-    blocks of times.
+    """Estimates from sums of shape (times, ...) and their ``standard_errors``, which include the
+    correlation between times.
 
     ``estimate`` maps sums with any leading axes to named estimates with the same leading axes.
-    Times are merged into at most ``BLOCKS`` blocks, and these into larger ones, so the errors
-    include the correlation between times.
     """
-    times = len(next(iter(sums.values())))
-    blocks = min(times, BLOCKS)
-    first = np.arange(blocks) * times // blocks
-    merged = {name: np.add.reduceat(np.asarray(x, float), first)[None] for name, x in sums.items()}
-    value, error = jackknife(estimate, merged)
-    return {name: Measured(x, np.asarray(error[name])) for name, x in value.items()}
+    one_seed = {name: np.asarray(x, float)[None] for name, x in sums.items()}
+    values, errors = standard_errors(estimate, one_seed)
+    return {name: Measured(values[name], errors[name]) for name in values}
 
 
 def ratio(numerator: Any, denominator: Any) -> np.ndarray:

@@ -13,8 +13,10 @@ from jaxgran.cli.terminal import say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError
 from jaxgran.model.display import with_error
+from jaxgran.reference.evaluation import Estimate
 from jaxgran.reference.table import MEASURED, THEORIES, shipped_table
-from jaxgran.reference.validity import ASSUMPTIONS, COLUMNS, Validity, validity
+from jaxgran.reference.validity import COLUMNS, Validity, validity
+from jaxgran.theory.assumptions import ASSUMPTIONS
 
 WHERE_EXAMPLES = {
     "Error of kinetic theory at a restitution and a packing fraction": "jaxgran where "
@@ -97,7 +99,8 @@ def _print_point(flow: Validity, factors: bool, corrected: bool) -> None:
     about = f"{pair}; ± 95 %; units of m, σ and 1/γ̇"
     print_table(about, COLUMNS[:columns], (row[:columns] for row in flow.rows()))
     if factors:
-        rows = [*zip(ASSUMPTIONS.values(), _factors(flow, with_error), strict=True)]
+        statements = (assumption.statement for assumption in ASSUMPTIONS.values())
+        rows = [*zip(statements, _factors(flow, with_error), strict=True)]
         rows.append(("all of these", f"{float(flow.over_enskog()):#.3g}"))
         print_table(_FACTORS, ("assumed", "factor if measured instead"), rows)
     _print_source()
@@ -109,15 +112,10 @@ def _print_plane(flow: Validity, factors: bool, corrected: bool) -> None:
         point = flow.at(place)
         pair = [f"{point.restitution:g}", f"{point.packing_fraction:g}"]
         averages = [
-            in_brackets(float(point.measured[name]), float(point.measured_ci95[name]))
-            for name in ("force_ratio", "pressure")
+            in_brackets(*map(float, point.measured[name])) for name in ("force_ratio", "pressure")
         ]
-        errors = [(point.error, point.error_ci95)]
-        errors += [(point.corrected_error, point.corrected_error_ci95)] if corrected else []
-        percents = [
-            in_brackets(100 * float(error["pressure"]), 100 * float(ci95["pressure"]))
-            for error, ci95 in errors
-        ]
+        errors = [point.error, point.corrected_error][: 1 + corrected]
+        percents = [in_brackets(*(100 * float(x) for x in error["pressure"])) for error in errors]
         rows.append([*pair, *averages, *percents, point.fails_first().replace("_", " ")])
         factor_rows.append([*pair, *_factors(point, in_brackets)])
     about = "In brackets: 95 % half-width of the last digits"
@@ -132,7 +130,7 @@ def _print_plane(flow: Validity, factors: bool, corrected: bool) -> None:
 
 def _factors(flow: Validity, text: Callable[[float, float], str]) -> list[str]:
     """The factor of every assumption, with its interval."""
-    return [text(float(flow.factors[x]), float(flow.factors_ci95[x])) for x in ASSUMPTIONS]
+    return [text(*map(float, flow.factors[name])) for name in ASSUMPTIONS]
 
 
 def _print_source() -> None:
@@ -166,23 +164,19 @@ def _entries(flow: Validity) -> dict[str, Entry]:
     }
     of_theory = "kinetic theory over measured average, less one"
     groups = (
-        ("", flow.measured, flow.measured_ci95, "measured average"),
-        ("theory/", flow.theory, {}, "prediction of kinetic theory"),
-        ("error/", flow.error, flow.error_ci95, of_theory),
-        ("corrected/", flow.corrected, {}, "prediction of the corrected theory"),
-        (
-            "corrected_error/",
-            flow.corrected_error,
-            flow.corrected_error_ci95,
-            f"corrected {of_theory[8:]}",
-        ),
-        ("factor/", flow.factors, flow.factors_ci95, "contact pressure as measured, over that if "),
+        ("", flow.measured, "measured average"),
+        ("theory/", flow.theory, "prediction of kinetic theory"),
+        ("error/", flow.error, of_theory),
+        ("corrected/", flow.corrected, "prediction of the corrected theory"),
+        ("corrected_error/", flow.corrected_error, f"corrected {of_theory[8:]}"),
+        ("factor/", flow.factors, "contact pressure as measured, over that if "),
     )
-    for group, values, half_widths, meaning in groups:
-        for name, value in values.items():
+    for group, values, meaning in groups:
+        for name, x in values.items():
+            value, ci95 = x if isinstance(x, Estimate) else (x, None)
             unit = _UNITS[name] if group in ("", "theory/", "corrected/") else "1"
-            words = meaning + ASSUMPTIONS.get(name, "")
-            entries[group + name] = Entry(value, words, unit, ci95=half_widths.get(name))
+            words = meaning + (ASSUMPTIONS[name].statement if group == "factor/" else "")
+            entries[group + name] = Entry(value, words, unit, ci95=ci95)
     grains = head["grains"]  # a number, or in words where it depends on the flow
     entries["grains"] = Entry(
         int(grains) if grains.isdecimal() else grains, "number of grains of the reference map"

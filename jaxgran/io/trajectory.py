@@ -56,7 +56,7 @@ from jaxgran.dynamics.engine import checked_numerics
 from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.dynamics.snapshots import snapshots_from
 from jaxgran.files import atomic_write, other_version
-from jaxgran.io.paths import require_place
+from jaxgran.io.paths import require_absent, require_place
 from jaxgran.model.cell import centred, remap_tilt
 from jaxgran.model.checks import InputError, at_most, refused, require_number, short_repr
 from jaxgran.model.flow import ShearFlow, require_sheared, steps_of_strain
@@ -173,37 +173,21 @@ def write_trajectory(
     """
     path = _as_path(path)
     check_trajectory(path)
-    if path.exists() and not overwrite:
-        raise InputError(
-            f"path must be a new file, or overwrite must be True: {short_repr(str(path))} exists."
-        )
-    if not isinstance(states, State) or np.ndim(states.side) != 1 or np.size(states.side) == 0:
-        raise InputError(
-            "states must have one leading axis of frames: stack them, or take those of "
-            "snapshot_series."
-        )
-    frames = [states[k] for k in range(len(states))]
-    for number, state in enumerate(frames):
-        _require_frame(flow, state, frames[0], number)
+    if not overwrite:
+        require_absent(path, "path")
     strains = np.asarray(strain, np.float64)
-    if strains.shape != (len(frames),):
-        raise InputError(f"strain must have one number for each of the {len(frames)} states.")
-    require_sheared(flow)
-    steps = steps_of_strain(flow, strains - strains[0])
-    if not np.all(np.diff(steps) >= 1):
-        raise InputError("strain must increase by at least one time step from frame to frame.")
-    _require_tilts(states, strains, steps)
+    steps = _steps_of_frames(flow, states, strains)
     numerics = checked_numerics(solver, None)
-    least = float(np.min(np.diff(strains), initial=np.inf))
     if force_strain is not None:
+        least = float(np.min(np.diff(strains), initial=np.inf))
         accepted = f"above 0 and at most the strain between frames, {least:g}"
         require_number(
             "force_strain", force_strain, lambda x: (x > 0) & at_most(x, least), accepted
         )
     worst = Status.ok
     with atomic_write(path) as temporary:
-        for state, step in zip(frames, steps.astype(int).tolist(), strict=True):
-            frame = snapshots_from(flow, numerics, state, force_strain or 0.0)
+        for number, step in enumerate(steps):
+            frame = snapshots_from(flow, numerics, states[number], force_strain or 0.0)
             worst = max(worst, np.max(frame.status))
             _append(temporary, frame, step)
     if worst > Status.ok:
@@ -216,28 +200,38 @@ def lost_forces(worst: int) -> str:
     return f"forces of some frames are missing or not converged, status {name}: {MEANINGS[name]}."
 
 
-def _require_frame(flow: ShearFlow, state: State, first: State, number: int) -> None:
-    """Raise an InputError unless this is a finite state of the flow with the first one's grains."""
-    try:
-        require_state(flow, state)
-    except InputError as mistake:
-        raise InputError(f"state {number} cannot be written: {mistake}") from None
-    if state.grains != first.grains:
+def _steps_of_frames(flow: ShearFlow, states: State, strains: np.ndarray) -> list[int]:
+    """Time steps from the first state to each; an InputError unless all are finite states of the
+    flow with the same grains, and fit the strains.
+    """
+    if not isinstance(states, State) or np.ndim(states.side) != 1 or np.size(states.side) == 0:
         raise InputError(
-            f"states must have the same grains, and state {number} has others than the first."
+            "states must have one leading axis of frames: stack them, or take those of "
+            "snapshot_series."
         )
-    if canonicalize_dtype(state.positions.dtype) != state.positions.dtype:
+    for number in range(len(states)):
+        try:
+            require_state(flow, states[number])
+        except InputError as mistake:
+            raise InputError(f"state {number} cannot be written: {mistake}") from None
+        if states[number].grains != states[0].grains:
+            raise InputError(
+                f"states must have the same grains, and state {number} has others than the first."
+            )
+    if canonicalize_dtype(states.positions.dtype) != states.positions.dtype:
         raise InputError(
             "states must be in the precision of JAX, which is now float32: turn on float64 "
             '(jax.config.update("jax_enable_x64", True)).'
         )
-
-
-def _require_tilts(states: State, strains: np.ndarray, steps: np.ndarray) -> None:
-    """Raise an InputError unless the cell is tilted from frame to frame by the strain, up to a time
-    step, as both are rounded to whole ones, and to the rounding of each step.
-    """
+    if strains.shape != (len(states),):
+        raise InputError(f"strain must have one number for each of the {len(states)} states.")
+    require_sheared(flow)
+    steps = steps_of_strain(flow, strains - strains[0])
     apart, count = np.diff(strains), np.diff(steps)
+    if not np.all(count >= 1):
+        raise InputError("strain must increase by at least one time step from frame to frame.")
+    # tilt and strain agree up to a time step, as both are rounded to whole ones, and to the
+    # rounding of each step
     wrong = remap_tilt(np.diff(np.asarray(states.tilt, np.float64)) - apart)
     allowed = 1.01 * apart / count + np.finfo(states.tilt.dtype).eps * count
     if np.any(bad := np.abs(wrong) > allowed):
@@ -245,6 +239,7 @@ def _require_tilts(states: State, strains: np.ndarray, steps: np.ndarray) -> Non
             "strain must be that by which the cell is tilted between the states: states "
             f"{(k := int(np.argmax(bad)))} and {k + 1} differ by {wrong[k]:.3g} from it."
         )
+    return steps.astype(int).tolist()
 
 
 def _as_path(path: str | os.PathLike) -> Path:

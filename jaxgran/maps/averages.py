@@ -20,7 +20,7 @@ from jaxgran.model.status import GIVEN_UP, Status
 from jaxgran.sampling.budget import LARGE_SYSTEM, Estimate, large_system
 from jaxgran.sampling.correlation_strain import mass_of_grains
 from jaxgran.sampling.drift import is_drifting
-from jaxgran.sampling.enskog_factors import FACTORS, LENGTHS, measured_over_enskog
+from jaxgran.sampling.enskog_factors import LENGTHS, measured_over_enskog
 from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.prediction import kinetic_theory
 from jaxgran.sampling.sample import (
@@ -30,13 +30,14 @@ from jaxgran.sampling.sample import (
     estimates,
     lengths,
 )
+from jaxgran.theory.assumptions import ASSUMPTIONS
 
 Seeds = Sequence[Replica | None]  # of a point, in order; None for one that has not run
 _LARGEST = 1e12  # a prediction above it has no steady state
 _SIZES = {"axis_a": 2, "axis_b": 2, "observable": len(SCALARS)}
 _OVER_ENSKOG = {
     "theory/enskog_pressure": "enskog_pressure",
-    **{f"theory/enskog_factor_pressure_{name}": f"pressure_{name}" for name in FACTORS},
+    **{f"theory/enskog_factor_pressure_{name}": f"pressure_{name}" for name in ASSUMPTIONS},
     **{f"theory/{name}": name for name in LENGTHS},
 }
 

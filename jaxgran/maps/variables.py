@@ -10,8 +10,9 @@ import numpy as np
 from jaxgran.maps.schema import path_of
 from jaxgran.model.status import Status
 from jaxgran.sampling.budget import LARGE_SYSTEM, MEASURED_POLYDISPERSITY, MEASURED_RANGES
-from jaxgran.sampling.enskog_factors import FACTORS, LENGTHS
+from jaxgran.sampling.enskog_factors import LENGTHS
 from jaxgran.sampling.observables import GROUPS, OBSERVABLES, STRESS_UNIT
+from jaxgran.theory.assumptions import ASSUMPTIONS
 
 NOT_RUN = -1
 """Status of a replica without a result."""
@@ -96,8 +97,8 @@ def _of_theory() -> dict[str, Variable]:
         STRESS_UNIT,
         has_error=True,
     )
-    for name, (measured, assumed) in FACTORS.items():
-        meaning = f"contact pressure with {measured} over that with {assumed}"
+    for name, row in ASSUMPTIONS.items():
+        meaning = f"contact pressure with {row.measured} over that with {row.assumed}"
         rows[f"theory/enskog_factor_pressure_{name}"] = Variable(meaning, has_error=True)
     for name, meaning in LENGTHS.items():
         rows[f"theory/{name}"] = Variable(meaning, "sigma", has_error=True)

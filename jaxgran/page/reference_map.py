@@ -8,12 +8,13 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.reference.table import FACTORS, LENGTH, shipped_table
+from jaxgran.reference.table import LENGTH, shipped_table
 from jaxgran.reference.validity import COLUMNS, validity
 from jaxgran.sampling.observables import OBSERVABLES
+from jaxgran.theory.assumptions import ASSUMPTIONS
 
 _PLANE = ("packing_fraction", "restitution")
-_PATHS = {f"pressure_{name}": f"theory/enskog_factor_pressure_{name}" for name in FACTORS} | {
+_PATHS = {f"pressure_{name}": f"theory/enskog_factor_pressure_{name}" for name in ASSUMPTIONS} | {
     LENGTH: f"theory/{LENGTH}"
 }
 
@@ -32,7 +33,7 @@ def reference_dataset() -> xr.Dataset:
         grid[places] = values
         variables[name] = _PLANE, grid, attributes
 
-    for name in table.shapes:
+    for name in table.surfaces:
         path, stderr = _PATHS.get(name, name), table.columns[f"{name}_stderr"]
         meaning, unit = name.replace("_", " "), "sigma" if name == LENGTH else "1"
         if name in OBSERVABLES:
@@ -49,10 +50,10 @@ def reference_dataset() -> xr.Dataset:
     for name, error in answer.error.items():
         put(
             f"{name}_error_of_theory",
-            error,
+            error.value,
             long_name="kinetic theory over measured average, less one",
         )
-        put(f"{name}_error_of_theory_ci95", answer.error_ci95[name])
+        put(f"{name}_error_of_theory_ci95", error.ci95)
     timestep = float(table.head["timestep"])
     attributes = {"title": f"The reference map of jaxgran: {table.made_with}", "timestep": timestep}
     return xr.Dataset(variables, dict(zip(_PLANE, axes, strict=True)), attributes)

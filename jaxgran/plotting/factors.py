@@ -25,13 +25,14 @@ from jaxgran.plotting.style import (
     padded,
     styled,
 )
+from jaxgran.theory.assumptions import ASSUMPTIONS
 
+_COLOURS = "#3a86b4", "#7f7f7f", "#d08700", "#8a5aa8", "#c0392b"
 FACTORS = {
-    "local_temperature": ("local temperature", "#3a86b4", "o"),
-    "anisotropy": ("anisotropy", "#7f7f7f", "s"),
-    "chaos": ("molecular chaos", "#d08700", "^"),
-    "pairs": ("pairs at contact", "#8a5aa8", "D"),
-    "binary": ("binary collisions", "#c0392b", "v"),
+    name: (assumption.label, colour, marker)
+    for (name, assumption), colour, marker in zip(
+        ASSUMPTIONS.items(), _COLOURS, "os^Dv", strict=True
+    )
 }
 """Factors of the contact pressure over Enskog's at the measured granular temperature: their names,
 colours and markers.

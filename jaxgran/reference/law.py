@@ -16,36 +16,38 @@ from jaxgran.files import atomic_write
 from jaxgran.io.paths import require_absent
 from jaxgran.model.checks import as_array, require
 from jaxgran.model.display import WithError, text_of
-from jaxgran.reference.evaluation import PLANE, estimates, module_of, over_range
-from jaxgran.reference.table import LENGTH, MEASURED, Table, shipped_table, write_columns
+from jaxgran.reference.evaluation import PLANE, Estimate, from_log, module_of, over_range
+from jaxgran.reference.table import (
+    LENGTH,
+    MEASURED,
+    Table,
+    shipped_table,
+    theory_of,
+    write_columns,
+)
 
 _UNITS = MEASURED | {LENGTH: "sigma"}
 _POWERS = dict.fromkeys(MEASURED, 2) | {"dissipation_rate": 3, LENGTH: 0}  # of the shear rate
 _STEP = 0.01  # between packing fractions of a file
-_INSIDE = (
-    "contents",
-    "theory",
-    "low",
-    "high",
-    "surface",
-    "points",
-)  # lines of the head of a table that say what else it holds
+# beginnings of lines of the head of a table that say what else it holds
+_INSIDE = ("contents", "theory", "low", "high", "surface")
 _MEANING = {  # of the numbers of a file
     "units": "m and sigma are mass and diameter of the mean grain, m = pi/4 sigma^2 times the "
     "density of the grain",
     "shear rate": "1/t; at shear rate s multiply by s^2, the dissipation rate by s^3, and the "
     "length by 1",
     "ci95": "half of the 95 % interval: sampling, interpolation, time step, tolerance and the "
-    "difference from a large "
-    "system, for the length sampling and interpolation; errors of neighbouring rows are correlated",
+    "difference from a large system, for the length sampling and interpolation; errors of "
+    "neighbouring rows are correlated",
     "interpolation": "of logarithms, in sqrt(1 - restitution) and packing_fraction",
 }
 
 
 class Rheology(NamedTuple):
-    """Averages of steady simple shear, and half-widths of their 95 % intervals.
+    """Averages of steady simple shear.
 
-    All arrays have the shape to which the arguments of the law broadcast; () for three numbers.
+    Each has ``value`` and ``ci95``, the half-width of its 95 % interval, both of the shape to which
+    the arguments of the law broadcast; () for three numbers.
 
     ================================  =========  ===================================================
     field                             unit       meaning
@@ -60,32 +62,21 @@ class Rheology(NamedTuple):
     dissipation_rate                  m/t³       Γ, energy lost per area and time, equals τγ̇;
                                                  proportional to γ̇³
     correlation_length_from_pressure  σ          L′ = (Γ_E/p_E)/(Γ/p), p the contact pressure, E
-                                                 Enskog's value at the
-                                                 measured local temperature; does not depend on γ̇
-    …_ci95                            as …       of each
+                                                 Enskog's value at the measured local temperature;
+                                                 does not depend on γ̇
     ================================  =========  ===================================================
     """
 
-    pressure: Any
-    shear_stress: Any
-    granular_temperature: Any
-    local_granular_temperature: Any
-    dissipation_rate: Any
-    correlation_length_from_pressure: Any
-    pressure_ci95: Any
-    shear_stress_ci95: Any
-    granular_temperature_ci95: Any
-    local_granular_temperature_ci95: Any
-    dissipation_rate_ci95: Any
-    correlation_length_from_pressure_ci95: Any
+    pressure: Estimate
+    shear_stress: Estimate
+    granular_temperature: Estimate
+    local_granular_temperature: Estimate
+    dissipation_rate: Estimate
+    correlation_length_from_pressure: Estimate
 
     def __repr__(self) -> str:
         """The averages, with ± half-widths of 95 % intervals."""
-        values = self._asdict()
-        averages = [name for name in values if not name.endswith("_ci95")]
-        return text_of(
-            "Rheology", {name: WithError(values[name], values[f"{name}_ci95"]) for name in averages}
-        )
+        return text_of("Rheology", {name: WithError(*x) for name, x in self._asdict().items()})
 
 
 @register_static
@@ -95,23 +86,13 @@ class ConstitutiveLaw:
     `constitutive_law`.
 
     A pytree without leaves, which can be passed to transformed functions or closed over.
-
-    ======  =====  ============================
-    field   type   meaning
-    ======  =====  ============================
-    table   Table  averages of a reference map
-    ======  =====  ============================
     """
 
-    table: Table
+    table: Table  # averages of a reference map
 
     def __repr__(self) -> str:
-        ranges = {
-            "restitution": self.restitution_range,
-            "packing_fraction": self.packing_fraction_range,
-        }
-        texts = (f"{name}={low:.3g} to {high:.3g}" for name, (low, high) in ranges.items())
-        return f"ConstitutiveLaw({', '.join(texts)})"
+        ranges = ("{}={:.3g} to {:.3g}".format(name, *self.table.range(name)) for name in PLANE)
+        return f"ConstitutiveLaw({', '.join(ranges)})"
 
     @property
     def restitution_range(self) -> tuple[float, float]:
@@ -124,7 +105,7 @@ class ConstitutiveLaw:
         return self.table.range("packing_fraction")
 
     def __call__(self, restitution: Any, packing_fraction: Any, shear_rate: Any = 1.0) -> Rheology:
-        """Averages of steady simple shear, with the half-widths of their 95 % intervals.
+        """Averages of steady simple shear, with their 95 % intervals.
 
         Args:
           restitution: α, a number or an array.
@@ -142,23 +123,22 @@ class ConstitutiveLaw:
         """
         shear_rate = as_array(shear_rate)
         require("shear_rate", shear_rate, lambda x: x > 0, "a positive number")
-        *_, averages = over_range(self.table, self._evaluated, restitution, packing_fraction)
+        *_, averages = over_range(self.table, self._at_unit_rate, restitution, packing_fraction)
         xp = module_of(restitution, packing_fraction, shear_rate)
         scaled = {}
-        for name, (value, ci95) in averages.items():
-            value, ci95, rate = xp.broadcast_arrays(value, ci95, xp.asarray(shear_rate, float))
-            scale = rate ** _POWERS[name]
-            scaled |= {name: value * scale, f"{name}_ci95": ci95 * scale}
+        for name, estimate in averages.items():
+            *numbers, rate = xp.broadcast_arrays(*estimate, xp.asarray(shear_rate, float))
+            scaled[name] = Estimate(*(x * rate ** _POWERS[name] for x in numbers))
         return Rheology(**scaled)
 
-    def _evaluated(self, where: Any, xp: Any) -> dict[str, tuple[Any, Any]]:
-        """Every average at unit shear rate and the half-width of its interval, at coordinates in
-        the range.
-        """
-        return {
-            name: estimate.value_and_ci95(xp)
-            for name, estimate in estimates(self.table, where, xp, _UNITS).items()
-        }
+    def _at_unit_rate(self, where: Any, xp: Any) -> dict[str, Estimate]:
+        """Every average at unit shear rate, at coordinates in the range."""
+        logs, averages = self.table.series(where, xp), {}
+        for name in _UNITS:
+            log, half = self.table.log_estimate(name, where, xp)
+            log_average = log if name == LENGTH else log + logs[theory_of(name)]
+            averages[name] = from_log(log_average, half, xp)
+        return averages
 
     def to_csv(
         self,
@@ -193,11 +173,9 @@ class ConstitutiveLaw:
         every = np.arange(np.ceil(low / _STEP), high / _STEP + 0.5) * _STEP
         nus = np.round(every, 2) if packing_fraction is None else np.ravel(packing_fraction)
         plane = [x.ravel() for x in np.meshgrid(alphas, nus, indexing="ij")]
-        columns = dict(zip(PLANE, plane, strict=True)) | self(*plane)._asdict()
-        columns = {
-            name: columns[name]
-            for name in (*PLANE, *(x + end for x in _UNITS for end in ("", "_ci95")))
-        }
+        columns: dict[str, Any] = dict(zip(PLANE, plane, strict=True))
+        for name, estimate in self(*plane)._asdict().items():
+            columns |= {name: estimate.value, f"{name}_ci95": estimate.ci95}
         made_with = {k: v for k, v in self.table.head.items() if not k.startswith(_INSIDE)}
         head = {
             "contents": "steady simple shear of rigid, frictionless discs as measured, "
@@ -224,7 +202,9 @@ def constitutive_law() -> ConstitutiveLaw:
     Examples:
       >>> law = constitutive_law()
       >>> slow, fast = law(0.7, 0.6), law(0.7, 0.6, shear_rate=2.0)
-      >>> float(fast.pressure / slow.pressure), float(fast.dissipation_rate / slow.dissipation_rate)
-      (4.0, 8.0)
+      >>> float(fast.pressure.value / slow.pressure.value)
+      4.0
+      >>> float(fast.dissipation_rate.value / slow.dissipation_rate.value)
+      8.0
     """
     return ConstitutiveLaw(shipped_table())

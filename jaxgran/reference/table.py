@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxgran.files import other_version
 from jaxgran.model.checks import InputError
+from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.reference.surface import Shape, Surface, coordinates, packing_fraction
 
 MEASURED = {
@@ -48,9 +49,6 @@ THEORY = ("pressure", "shear_stress", "granular_temperature")
 CORRECTED = "corrected_"
 """What the names of the series of ``corrected_shear`` begin with."""
 
-FACTORS = ("local_temperature", "anisotropy", "chaos", "pairs", "binary")
-"""Factors of the contact pressure over Enskog's, in the order of ``sampling.enskog_factors``."""
-
 FOLDER = Path(__file__).parent
 _FORMAT_VERSION = "1"  # of the files
 # the force ratio's surface is that of asinh((ratio − 1)/0.01): linear below, logarithmic above
@@ -63,15 +61,6 @@ _LEAST_STDERR = 1e-3  # of a value of a surface; without clusters, that of the f
 def theory_of(name: str) -> str:
     """The prediction that a measured average is compared with."""
     return "shear_stress" if name == "dissipation_rate" else name.removeprefix("local_")
-
-
-def to_surface(name: str, value: Any, stderr: Any, theory: Any = 1.0) -> tuple[Any, Any]:
-    """An average and its standard error as they are in its surface; measured averages are taken
-    over the theory's.
-    """
-    if name.startswith(RATIO):
-        return np.arcsinh((value - 1) / _EXCESS), stderr / np.hypot(value - 1, _EXCESS)
-    return np.log(value / theory), stderr / value
 
 
 def excess_from_surface(value: Any, xp: Any = np) -> Any:
@@ -130,19 +119,15 @@ class Table:
         return coordinates(self.columns["restitution"], self.columns["packing_fraction"])
 
     @cached_property
-    def ratios(self) -> dict[float, Surface]:
-        """The surfaces of the force ratio by time step."""
-        others = {
-            float(name.split("_at_")[1]): x
-            for name, x in self.surfaces.items()
-            if name.startswith(f"{RATIO}_at_")
-        }
-        return {float(self.head["timestep"]): self.surfaces[RATIO], **others}
-
-    @cached_property
     def surfaces(self) -> dict[str, Surface]:
-        """The surface of every average."""
-        return {name: self.surface(name, shape) for name, shape in self.shapes.items()}
+        """The surface of every average, of the shape in the head."""
+        surfaces = {}
+        for key, text in self.head.items():
+            if key.startswith("surface "):
+                amplitude, first, second, noise, left_out = map(float, text.split())
+                name, shape = key.split()[1], Shape(amplitude, (first, second), noise, left_out)
+                surfaces[name] = self.surface(name, shape)
+        return surfaces
 
     @cached_property
     def bounds(self) -> dict[str, Surface]:
@@ -150,30 +135,32 @@ class Table:
         is not.
         """
         bounds = {}
-        for name in self.shapes:
-            if f"{name}_bound" in self.columns:
-                scale = 1.0 if name == RATIO else self.columns[name]
-                values = np.log(self.columns[f"{name}_bound"] / scale)
-                stderrs = np.full(values.shape, _BOUND_STDERR)
-                bounds[name] = Surface(self.points, values, stderrs, _BOUND_SHAPE)
+        for name in (*MEASURED, RATIO):
+            scale = 1.0 if name == RATIO else self.columns[name]
+            values = np.log(self.columns[f"{name}_bound"] / scale)
+            stderrs = np.full(values.shape, _BOUND_STDERR)
+            bounds[name] = Surface(self.points, values, stderrs, _BOUND_SHAPE)
         return bounds
 
-    @cached_property
-    def shapes(self) -> dict[str, Shape]:
-        shapes = {}
-        for key, text in self.head.items():
-            if key.startswith("surface "):
-                amplitude, first, second, noise, left_out = map(float, text.split())
-                shape = Shape(amplitude, (first, second), noise, left_out)
-                shapes[key.removeprefix("surface ")] = shape
-        return shapes
+    def log_estimate(self, name: str, where: Any, xp: Any = np) -> tuple[Any, Any]:
+        """The logarithm of an average over the theory's, or of a factor or ``LENGTH``, and the
+        half-width of its 95 % interval.
+        """
+        log, stderr = self.surfaces[name](where, xp)
+        half = HALF_INTERVAL * stderr
+        if name in MEASURED:
+            half = xp.hypot(half, xp.exp(self.bounds[name].mean(where, xp)))
+        return log, half
 
     def surface(self, name: str, shape: Shape) -> Surface:
         """The surface of an average, of a given shape."""
-        theory = np.exp(self.series(self.points)[theory_of(name)]) if name in MEASURED else 1.0
-        values, stderrs = to_surface(
-            name, self.columns[name], self.columns[f"{name}_stderr"], theory
-        )
+        value, stderr = self.columns[name], self.columns[f"{name}_stderr"]
+        if name.startswith(RATIO):
+            values = np.arcsinh((value - 1) / _EXCESS)
+            stderrs = stderr / np.hypot(value - 1, _EXCESS)
+        else:
+            theory = np.exp(self.series(self.points)[theory_of(name)]) if name in MEASURED else 1.0
+            values, stderrs = np.log(value / theory), stderr / value
         known = np.isfinite(values)
         return Surface(
             self.points[known], values[known], np.maximum(stderrs[known], _LEAST_STDERR), shape

@@ -14,78 +14,65 @@ import numpy as np
 
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import WithError, text_of, to_two_digits, with_error
-from jaxgran.reference.evaluation import estimates, over_range
+from jaxgran.reference.evaluation import Estimate, from_log, over_range
 from jaxgran.reference.table import (
     CORRECTED,
-    FACTORS,
+    MEASURED,
+    RATIO,
     Table,
     excess_from_surface,
     shipped_table,
     theory_of,
 )
+from jaxgran.theory.assumptions import ASSUMPTIONS, NEGLIGIBLE
 
 COLUMNS = ("average", "measured", "theory", "error", "error if corrected")
 """What ``Validity.rows`` gives of every average."""
 
-ASSUMPTIONS = {
-    "local_temperature": "the granular temperature equals the local one",
-    "anisotropy": "velocities are isotropic",
-    "chaos": "velocities of colliding grains are independent",
-    "pairs": "as many pairs are at contact as in equilibrium",
-    "binary": "collisions are binary",
-}
-"""What the theory assumes, by the name of its factor."""
-
-_NEGLIGIBLE = 0.02  # a factor of the contact pressure this close to one is not said to fail
+_BINARY = 0.05  # excess of the force ratio below which collisions are said to be binary
 
 
 class Validity(NamedTuple):
     """What was measured at a restitution and a packing fraction, and what kinetic theory says.
 
-    All arrays have the shape to which restitution and packing fraction broadcast; () for two
-    numbers. ``NAME_ci95`` is the half-width of a 95 % interval.
+    Measured averages, errors and factors are estimates: ``value`` and ``ci95``, the half-width of
+    its 95 % interval. All arrays have the shape to which restitution and packing fraction
+    broadcast; () for two numbers.
 
-    =============  =================================================================================
-    field          content
-    =============  =================================================================================
-    measured       average by name: pressure and shear_stress in m/t², granular_temperature and
-                   local_granular_temperature in m(σ/t)², dissipation_rate in m/t³, force_ratio
-    measured_ci95  of each: sampling, interpolation, time step, tolerance, and the difference from a
-                   large system
-    theory         pressure, shear_stress, granular_temperature and dissipation_rate of kinetic
-                   theory, same units
-    error          theory over measured, less one, of all but the granular temperature and the force
-                   ratio; the theory's temperature is compared with the local one
-    error_ci95     of each
-    corrected      the same predictions by ``corrected_shear``, with measured laws of correlations
-                   and pairs
-    corrected_error, corrected_error_ci95 as error and error_ci95
-    factors        the assumptions of Enskog's contact pressure at the measured granular
-                   temperature, by name: factors whose product is the measured contact pressure over
-                   Enskog's (``sampling.enskog_factors``)
-    factors_ci95   of each, from sampling and interpolation at the number of grains of the map
-    =============  =================================================================================
+    ===============  ===============================================================================
+    field            content
+    ===============  ===============================================================================
+    measured         estimates by name: pressure and shear_stress in m/t², granular_temperature and
+                     local_granular_temperature in m(σ/t)², dissipation_rate in m/t³, force_ratio.
+                     Their intervals contain sampling, interpolation, time step, tolerance, and the
+                     difference from a large system
+    theory           pressure, shear_stress, granular_temperature and dissipation_rate of kinetic
+                     theory, same units
+    error            theory over measured, less one, of all but the granular temperature and the
+                     force ratio; the theory's temperature is compared with the local one
+    corrected        the predictions of ``corrected_shear``, with measured laws of correlations and
+                     pairs
+    corrected_error  the same errors of these
+    factors          the assumptions of Enskog's contact pressure at the measured granular
+                     temperature, by name: factors whose product is the measured contact pressure
+                     over Enskog's (``sampling.enskog_factors``); from sampling and interpolation at
+                     the number of grains of the map
+    ===============  ===============================================================================
     """
 
     restitution: Any
     packing_fraction: Any
-    measured: dict[str, Any]
-    measured_ci95: dict[str, Any]
+    measured: dict[str, Estimate]
     theory: dict[str, Any]
-    error: dict[str, Any]
-    error_ci95: dict[str, Any]
+    error: dict[str, Estimate]
     corrected: dict[str, Any]
-    corrected_error: dict[str, Any]
-    corrected_error_ci95: dict[str, Any]
-    factors: dict[str, Any]
-    factors_ci95: dict[str, Any]
+    corrected_error: dict[str, Estimate]
+    factors: dict[str, Estimate]
 
     def __repr__(self) -> str:
         """Where it is, and the measured averages with ± half-widths of 95 % intervals."""
         where = {"restitution": self.restitution, "packing_fraction": self.packing_fraction}
-        measured = {
-            name: WithError(x, self.measured_ci95[name]) for name, x in self.measured.items()
-        }
+        measured = {name: WithError(*estimate) for name, estimate in self.measured.items()}
         return text_of("Validity", where | measured)
 
     def fails_first(self) -> Any:
@@ -94,14 +81,14 @@ class Validity(NamedTuple):
 
         For values that are known, not traced by JAX: a string, or an array of strings.
         """
-        logs = np.abs(np.log([self.factors[name] for name in FACTORS]))
-        names = np.array(FACTORS, object)[np.argmax(logs, axis=0)]
-        failing = np.where(np.max(logs, axis=0) > _NEGLIGIBLE, names, "none")
+        logs = np.abs(np.log([self.factors[name].value for name in ASSUMPTIONS]))
+        names = np.array([*ASSUMPTIONS], object)[np.argmax(logs, axis=0)]
+        failing = np.where(np.max(logs, axis=0) > NEGLIGIBLE, names, "none")
         return failing if failing.ndim else str(failing)
 
     def over_enskog(self) -> Any:
         """The measured contact pressure over Enskog's at the measured granular temperature."""
-        return math.prod(self.factors[name] for name in FACTORS)
+        return math.prod(self.factors[name].value for name in ASSUMPTIONS)
 
     def at(self, place: Any) -> "Validity":
         """One flow of an array of flows, or a part of them; for values that are known, not
@@ -109,21 +96,19 @@ class Validity(NamedTuple):
         """
 
         def part(x: Any) -> Any:
-            return (
-                {name: part(value) for name, value in x.items()}
-                if isinstance(x, dict)
-                else np.asarray(x)[place]
-            )
+            if isinstance(x, dict):
+                return {name: part(value) for name, value in x.items()}
+            return type(x)(*map(part, x)) if isinstance(x, tuple) else np.asarray(x)[place]
 
-        return Validity(*map(part, self))
+        return part(self)
 
     def verdict(self) -> Any:
         """The answer in words for every flow: a string, or an array of strings. Values must not
         be traced.
         """
-        verdicts = np.empty(np.shape(self.error["pressure"]), object)
+        verdicts = np.empty(np.shape(self.error["pressure"].value), object)
         for place in np.ndindex(verdicts.shape):
-            verdicts[place] = self.at(place)._verdict()
+            verdicts[place] = _verdict(self.at(place))
         return verdicts if verdicts.ndim else verdicts.item()
 
     def rows(self) -> list[list[str]]:
@@ -131,58 +116,57 @@ class Validity(NamedTuple):
         % interval.
         """
         rows = []
-        for name, measured in self.measured.items():
-            predicted = self.theory.get(name.removeprefix("local_"))
-            theory, errors = "", ["", ""]
+        for name, (value, ci95) in self.measured.items():
+            row = [name.replace("_", " "), with_error(float(value), float(ci95)), "", "", ""]
             if name in self.error:
-                theory = f"{predicted:.4g}"
-                of_theories = (
-                    (self.error[name], self.error_ci95[name]),
-                    (self.corrected_error[name], self.corrected_error_ci95[name]),
-                )
-                errors = [
-                    f"{with_error(100 * float(x), 100 * float(ci95))} %" for x, ci95 in of_theories
-                ]
-            interval = with_error(float(measured), float(self.measured_ci95[name]))
-            rows.append([name.replace("_", " "), interval, theory, *errors])
+                row[2] = f"{self.theory[name.removeprefix('local_')]:.4g}"
+                errors = self.error[name], self.corrected_error[name]
+                row[3:] = [_percent(float(error), float(ci95)) for error, ci95 in errors]
+            rows.append(row)
         return rows
 
-    def _verdict(self) -> str:
-        """The verdict on one flow."""
-        pressure, of_temperature = map(self._departure, ("pressure", "local_granular_temperature"))
-        same = pressure[0] == of_temperature[0]
-        start = (
-            f"Kinetic theory {pressure[0]} the pressure{pressure[1]} and "
-            f"{'' if same else of_temperature[0] + ' '}the local temperature{of_temperature[1]}"
-        )
-        first = self.fails_first()
-        enskog = "Enskog's contact pressure"
-        if first == "none":
-            cause = f"Each of its assumptions holds within 2 %; all together make {enskog}"
-        else:
-            cause = (
-                f"The assumption that is violated most is that {ASSUMPTIONS[first]}: alone it "
-                f"makes {enskog} {_deviation(self.factors[first])}; all together make it"
-            )
-        ratio, ratio_ci95 = (float(x["force_ratio"]) for x in (self.measured, self.measured_ci95))
-        off = max(ratio - 1, 0.0) + ratio_ci95
-        step = f"dt = {shipped_table().timestep}/γ̇"
-        if off < 0.05:
-            most = 1 + float(f"{off:.1g}")
-            binary = f"Collisions are binary (force ratio at most {most:g}, {step})"
-        else:
-            explained = f"{100 / ratio:.2g} % of the mean contact force"
-            binary = f"Binary collisions explain {explained} ({step})"
-        joint = f"{_deviation(self.over_enskog())} at the measured temperature"
-        return f"{start}. {cause} {joint}; the rest is the error of the temperature. {binary}."
 
-    def _departure(self, name: str) -> tuple[str, str]:
-        """What the theory does with an average: a verb, and by how much."""
-        error, ci95 = (100 * float(x[name]) for x in (self.error, self.error_ci95))
-        if abs(error) <= ci95:
-            return "agrees with", f" (error {with_error(error, ci95)} %)"
-        side = "over" if error > 0 else "under"
-        return f"{side}estimates", f" by {with_error(abs(error), ci95)} %"
+def _verdict(flow: Validity) -> str:
+    """The verdict on one flow."""
+    names = "pressure", "local_granular_temperature"
+    (verb, amount), (verb_of_temperature, amount_of_temperature) = (
+        _departure(*map(float, flow.error[name])) for name in names
+    )
+    again = "" if verb == verb_of_temperature else f"{verb_of_temperature} "
+    first, enskog = flow.fails_first(), "Enskog's contact pressure"
+    if first == "none":
+        within = f"{100 * NEGLIGIBLE:g} %"
+        cause = f"Each of its assumptions holds within {within}; all together make {enskog}"
+    else:
+        cause = (
+            f"The assumption that is violated most is that {ASSUMPTIONS[first].statement}: alone "
+            f"it makes {enskog} {_deviation(flow.factors[first].value)}; all together make it"
+        )
+    ratio, ratio_ci95 = map(float, flow.measured[RATIO])
+    excess = max(ratio - 1, 0.0) + ratio_ci95
+    step = f"dt = {shipped_table().timestep}/γ̇"
+    if excess < _BINARY:
+        most = 1 + float(f"{excess:.1g}")
+        binary = f"Collisions are binary (force ratio at most {most:g}, {step})"
+    else:
+        binary = f"Binary collisions explain {100 / ratio:.2g} % of the mean contact force ({step})"
+    return (
+        f"Kinetic theory {verb} the pressure{amount} and {again}the local temperature"
+        f"{amount_of_temperature}. {cause} {_deviation(flow.over_enskog())} at the measured "
+        f"temperature; the rest is the error of the temperature. {binary}."
+    )
+
+
+def _departure(error: float, ci95: float) -> tuple[str, str]:
+    """What the theory does with an average: a verb, and by how much."""
+    if abs(error) <= ci95:
+        return "agrees with", f" (error {_percent(error, ci95)})"
+    verb = "overestimates" if error > 0 else "underestimates"
+    return verb, f" by {_percent(abs(error), ci95)}"
+
+
+def _percent(error: float, ci95: float) -> str:
+    return f"{with_error(100 * error, 100 * ci95)} %"
 
 
 def _deviation(factor: Any) -> str:
@@ -212,45 +196,38 @@ def validity(restitution: Any, packing_fraction: Any) -> Validity:
 
     Examples:
       >>> at_point = validity(0.98, 0.5)
-      >>> bool(abs(at_point.error["pressure"]) < 0.05)
+      >>> bool(abs(at_point.error["pressure"].value) < 0.05)
       True
     """
     table = shipped_table()
-    alpha, nu, averages = over_range(
-        table, partial(_evaluated, table), restitution, packing_fraction
-    )
-    return Validity(alpha, nu, *averages)
+    alpha, nu, answer = over_range(table, partial(_answer, table), restitution, packing_fraction)
+    return Validity(alpha, nu, *answer)
 
 
-def _evaluated(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
+def _answer(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
     """The dictionaries of a ``Validity`` at coordinates in the measured range."""
-    measured, ci95, theory, error, error_ci95, corrected, corrected_error, corrected_ci95 = (
-        {} for _ in range(8)
-    )
+    measured, theory, error, corrected, corrected_error = {}, {}, {}, {}, {}
     logs = table.series(where, xp)
-    for name, estimate in estimates(table, where, xp).items():
-        log = logs[CORRECTED + theory_of(name)]
-        measured[name], ci95[name] = estimate.value_and_ci95(xp)
+    for name in MEASURED:
+        log, half = table.log_estimate(name, where, xp)
+        log_theory, log_corrected = (logs[x + theory_of(name)] for x in ("", CORRECTED))
+        measured[name] = from_log(log + log_theory, half, xp)
         if not name.startswith("local_"):
-            theory[name], corrected[name] = xp.exp(estimate.log_theory), xp.exp(log)
+            theory[name], corrected[name] = xp.exp(log_theory), xp.exp(log_corrected)
         if name != "granular_temperature":
-            error[name] = xp.expm1(-estimate.log_ratio)
-            error_ci95[name] = xp.exp(-estimate.log_ratio) * xp.sinh(estimate.log_half)
-            log_ratio = estimate.log_ratio + estimate.log_theory - log
-            corrected_error[name], corrected_ci95[name] = (
-                xp.expm1(-log_ratio),
-                xp.exp(-log_ratio) * xp.sinh(estimate.log_half),
-            )
-    value, stderr = table.surfaces["force_ratio"](where, xp)
-    measured["force_ratio"] = 1 + excess_from_surface(value, xp)
+            error[name] = _less_one(-log, half, xp)
+            corrected_error[name] = _less_one(-(log + log_theory - log_corrected), half, xp)
+    value, stderr = table.surfaces[RATIO](where, xp)
     sampling = excess_from_surface(HALF_INTERVAL * stderr, xp) * xp.cosh(value)
-    ci95["force_ratio"] = xp.hypot(sampling, xp.exp(table.bounds["force_ratio"].mean(where, xp)))
-    factors, factors_ci95 = {}, {}
-    for name in FACTORS:
-        log, stderr = table.surfaces[f"pressure_{name}"](where, xp)
-        factors[name], factors_ci95[name] = (
-            xp.exp(log),
-            xp.exp(log) * xp.sinh(HALF_INTERVAL * stderr),
-        )
-    corrections = corrected, corrected_error, corrected_ci95
-    return measured, ci95, theory, error, error_ci95, *corrections, factors, factors_ci95
+    ci95 = xp.hypot(sampling, xp.exp(table.bounds[RATIO].mean(where, xp)))
+    measured[RATIO] = Estimate(1 + excess_from_surface(value, xp), ci95)
+    factors = {
+        name: from_log(*table.log_estimate(f"pressure_{name}", where, xp), xp)
+        for name in ASSUMPTIONS
+    }
+    return measured, theory, error, corrected, corrected_error, factors
+
+
+def _less_one(log: Any, half: Any, xp: Any) -> Estimate:
+    """A quotient less one, from its logarithm."""
+    return Estimate(xp.expm1(log), from_log(log, half, xp).ci95)

@@ -63,13 +63,6 @@ RATES = {
     "shear_stress": "contact shear stress",
     "dissipation_rate": "dissipation rate",
 }
-FACTORS = {  # what is measured, and what is assumed in its place
-    "local_temperature": ("the measured local temperature", "the granular temperature"),
-    "anisotropy": ("the measured temperature tensor", "an isotropic one"),
-    "chaos": ("the measured speed of approach", "that of independent velocities"),
-    "pairs": ("the measured pairs at contact", "those of equilibrium"),
-    "binary": ("the measured impulses", "those of binary collisions"),
-}
 LENGTHS = {
     "correlation_length": "Enskog's dissipation rate over the measured one, at the local "
     "temperature",
@@ -96,12 +89,12 @@ def measured_over_enskog(
       grains: discs in the proportions of those of the flow; None where their diameters are uniform.
 
     Returns:
-      Values and errors by name: ``pressure_chaos`` and so on for each of ``RATES`` and ``FACTORS``,
-        dimensionless; ``enskog_pressure`` and ``enskog_shear_stress`` in m/t² and
-        ``enskog_dissipation_rate`` in m/t³, of isotropic Gaussian velocities at the measured
-        granular temperature; ``correlation_length`` L and ``correlation_length_from_pressure`` L′
-        in σ. What would be a quotient by zero is NaN, such as a factor without collisions or of the
-        dissipation rate of elastic grains.
+      Values and errors by name: ``pressure_chaos`` and so on for each of ``RATES`` and
+        ``theory.assumptions.ASSUMPTIONS``, dimensionless; ``enskog_pressure`` and
+        ``enskog_shear_stress`` in m/t² and ``enskog_dissipation_rate`` in m/t³, of isotropic
+        Gaussian velocities at the measured granular temperature; ``correlation_length`` L and
+        ``correlation_length_from_pressure`` L′ in σ. What would be a quotient by zero is NaN, such
+        as a factor without collisions or of the dissipation rate of elastic grains.
     """
     sums = jax.tree.map(
         lambda *x: np.stack([np.asarray(part) for part in x]), *(seed.tally for seed in seeds)

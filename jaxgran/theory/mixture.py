@@ -1,6 +1,6 @@
 """Mixtures of a few size classes."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,21 +34,16 @@ def uniform_mixture(nu: Float[Array, ""], width: Float[Array, ""], size_classes:
 
 
 def mixture_of(nu: Float[Array, ""], diameters: Array, masses: Array, fractions: Array) -> Mixture:
-    """A mixture of classes with given diameters, masses and number fractions, each (classes,)."""
-    mean, mean_square = jnp.sum(fractions * diameters), jnp.sum(fractions * diameters**2)
-    densities = fractions * nu / (jnp.pi / 4 * mean_square)
-    d_i, d_j = diameters[:, None], diameters[None, :]
-    chi = mixture_contact_value(d_i, d_j, nu, mean, mean_square)
-    return Mixture(diameters, masses, densities, densities[None, :] * (d_i + d_j) / 2 * chi)
+    """A mixture of classes with given diameters, masses and number fractions, each (classes,).
 
-
-def mixture_contact_value(d_i: Any, d_j: Any, nu: Any, mean: Any, mean_square: Any) -> Any:
-    """Contact value χ of discs of diameters d_i and d_j (broadcast) in an equilibrium mixture; of
-    JAX or NumPy arrays.
-
-    χ_ij = 1/(1 − ν) + (9/8) d_i d_j/(d_i + d_j) ν⟨d⟩/⟨d²⟩/(1 − ν)², with ν the packing fraction of
-    the mixture and ⟨d⟩ and ⟨d²⟩ of its diameters. For discs of one size it is Henderson's value.
+    The contact value of a pair is that of equilibrium, χ_ij = 1/(1 − ν) + (9/8) d_i d_j/(d_i + d_j)
+    ν⟨d⟩/⟨d²⟩/(1 − ν)²: for discs of one size it is Henderson's.
 
     Source: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
     """
-    return 1 / (1 - nu) + 9 / 8 * d_i * d_j / (d_i + d_j) * nu * mean / mean_square / (1 - nu) ** 2
+    mean, mean_square = jnp.sum(fractions * diameters), jnp.sum(fractions * diameters**2)
+    densities = fractions * nu / (jnp.pi / 4 * mean_square)
+    d_i, d_j = diameters[:, None], diameters[None, :]
+    crowding = 9 / 8 * d_i * d_j / (d_i + d_j) * nu * mean / mean_square
+    chi = 1 / (1 - nu) + crowding / (1 - nu) ** 2
+    return Mixture(diameters, masses, densities, densities[None, :] * (d_i + d_j) / 2 * chi)

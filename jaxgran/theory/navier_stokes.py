@@ -7,13 +7,7 @@ flow at small restitution. Units: ``steady_shear``.
 
 import jax.numpy as jnp
 
-from jaxgran.theory.steady_shear import (
-    Scalar,
-    SteadyShear,
-    as_floats,
-    contact_value,
-    maxwellian_collision_rate,
-)
+from jaxgran.theory.steady_shear import Scalar, SteadyShear, as_floats, contact_value
 
 
 def garzo_dufty(
@@ -58,7 +52,7 @@ def garzo_dufty(
     viscosity = kinetic * (1 + (1 + alpha) * nu * chi / 2) + bulk / 2
     temperature = jnp.pi / (64 * nu**2) * viscosity / cooling * rate**2
     dilute_viscosity = jnp.sqrt(temperature / (4 * jnp.pi))
-    maxwellian = maxwellian_collision_rate(density, chi, temperature)
+    maxwellian = 2 * jnp.sqrt(jnp.pi * temperature) * density * chi  # collisions per grain and time
     return SteadyShear(
         granular_temperature=temperature,
         pressure=density * temperature * (1 + (1 + alpha) * nu * chi),

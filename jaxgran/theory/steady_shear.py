@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Real
+from jaxtyping import Array, Float, Real
 
 Scalar = float | int | Real[Array, ""]
 
@@ -61,25 +60,6 @@ def contact_value(packing_fraction: Scalar) -> Float[Array, ""]:
     """
     nu = jnp.asarray(packing_fraction)
     return (1 - 7 * nu / 16) / (1 - nu) ** 2
-
-
-def maxwellian_collision_rate(density: Array, chi: Array, temperature: Array) -> Array:
-    """Collisions per grain and time of monodisperse discs with Maxwellian velocities.
-
-    ===========  ========  ==========================
-    density      1/σ²      grains per unit area
-    chi          –         contact value of the pairs
-    temperature  m(σ/t)²   granular temperature
-    returns      1/t       collision rate
-    ===========  ========  ==========================
-    """
-    return 2 * jnp.sqrt(jnp.pi * temperature) * density * chi
-
-
-def outside(value: Array, span: Array | np.ndarray) -> Bool[Array, "..."]:
-    """Whether a number is outside the range (2,) of a law, beyond rounding."""
-    slack = 8 * jnp.finfo(value.dtype).eps
-    return (value < span[0] - slack) | (value > span[1] + slack)
 
 
 def as_floats(*values: Scalar) -> list[Float[Array, ""]]:

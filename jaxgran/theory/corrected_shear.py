@@ -7,8 +7,9 @@ packing fraction, fitted to a map, say by how much; the balance of the moments t
 temperature and stresses. Units: ``steady_shear``.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,61 +19,44 @@ from jaxtyping import Array, Bool, Float
 from jaxgran.theory.gaussian_moments import steady_moments
 from jaxgran.theory.mixture import uniform_mixture
 from jaxgran.theory.navier_stokes import garzo_dufty
-from jaxgran.theory.steady_shear import Scalar, as_floats, outside
+from jaxgran.theory.steady_shear import Scalar, as_floats
 
 Numbers = Array | np.ndarray
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
-class CorrelationLaws:
-    """Coefficients of the laws of the correlation length and of the pairs at contact, and where
-    they come from.
+class CorrelationLaws(NamedTuple):
+    """Coefficients of the laws of the correlation length and of the pairs at contact, functions of
+    α and y = 1/(1 − ν/ν_J).
 
-    =======================  =====  ================================================================
-    field                    shape  meaning; all are dimensionless
-    =======================  =====  ================================================================
-    length                   (3,)   a, b, k of L = 1 + a (1 − α)² y + b (1 − α) y^k, y = 1/(1 −
-                                    ν/ν_J), in mean diameters
-    length_stderr            (3,)   their standard errors
-    pairs                    (3,)   c, e, m of R = (1 + c (1 − α)⁵) (1 + e (1 − α)^(1/3) y^m), pairs
-                                    at contact that carry the stress over those of equilibrium
-    pairs_stderr             (3,)   their standard errors
-    jamming_fraction         ()     ν_J
-    scatter                  (3,)   rms of the errors of ln T, ln p and ln τ at flows that were not
-                                    fitted
-    restitution_range        (2,)   smallest and largest α at which the scatter holds; nearly
-                                    elastic dense flow is more viscous than in Enskog's theory
-    packing_fraction_range   (2,)   smallest and largest ν at which the scatter holds
-    fitted_to, judged_on            maps, in words; static
-    =======================  =====  ================================================================
+    ================  =====  =======================================================================
+    field             shape  meaning; all are dimensionless
+    ================  =====  =======================================================================
+    length            (3,)   a, b, k of L = 1 + a (1 − α)² y + b (1 − α) y^k, in mean diameters
+    pairs             (3,)   c, e, m of R = (1 + c (1 − α)⁵) (1 + e (1 − α)^(1/3) y^m), pairs at
+                             contact that carry the stress over those of equilibrium
+    jamming_fraction  ()     ν_J
+    ================  =====  =======================================================================
     """
 
     length: Float[Numbers, " 3"]
-    length_stderr: Float[Numbers, " 3"]
     pairs: Float[Numbers, " 3"]
-    pairs_stderr: Float[Numbers, " 3"]
     jamming_fraction: Float[Numbers, ""]
-    scatter: Float[Numbers, " 3"]
-    restitution_range: Float[Numbers, " 2"]
-    packing_fraction_range: Float[Numbers, " 2"]
-    fitted_to: str = field(metadata={"static": True})
-    judged_on: str = field(metadata={"static": True})
 
 
 MEASURED_LAWS = CorrelationLaws(
     length=np.array([0.2245, 0.02589, 1.444]),
-    length_stderr=np.array([0.007616, 0.00335, 0.02961]),
     pairs=np.array([0.3816, 0.01606, 1.609]),
-    pairs_stderr=np.array([0.02311, 0.0008068, 0.01381]),
     jamming_fraction=np.array(0.8386),
-    scatter=np.array([0.1263, 0.1573, 0.149]),
-    restitution_range=np.array([0.1, 0.95]),
-    packing_fraction_range=np.array([0.1, 0.82]),
-    fitted_to="294 flows of N = 1600 to 16000, dt = 1e-4",
-    judged_on="30 flows of N = 1600, dt = 3e-4",
 )
-"""The laws of the benchmark ``dissipation``."""
+"""The laws of the benchmark ``dissipation``, fitted to 294 flows of N = 1600 to 16000, dt = 1e-4.
+Their standard errors are in its result.
+"""
+
+SCATTER = np.array([0.1263, 0.1573, 0.149])
+"""Rms errors of ln T, ln p and ln τ at 30 flows that were not fitted, N = 1600, dt = 3e-4."""
+
+RESTITUTION_RANGE, PACKING_FRACTION_RANGE = (0.1, 0.95), (0.1, 0.82)
+"""Where the scatter holds; nearly elastic dense flow is more viscous than in Enskog's theory."""
 
 
 @jax.tree_util.register_dataclass
@@ -133,7 +117,7 @@ def corrected_shear(
     polydispersity    σ     0 ≤ Δ < 1: diameters uniform in σ ± Δ
     size_classes      –     number of Gauss-Legendre points of the size
                             distribution; static, a change recompiles
-    laws              –     CorrelationLaws; with zeros for `length` and `pairs`
+    laws                    CorrelationLaws; with zeros for `length` and `pairs`
                             the theory is that of ``gaussian_moments``
     returns                 CorrectedShear; not finite at α = 1 and from ν_J on
     ================  ====  =======================================================
@@ -164,7 +148,7 @@ def corrected_shear(
     moments = steady_moments(
         alpha, rate, mixture, jnp.log(garzo_dufty(alpha, nu).granular_temperature), length
     )
-    of_temperature, of_pressure, of_shear = laws.scatter
+    of_temperature, of_pressure, of_shear = SCATTER.tolist()
     return CorrectedShear(
         granular_temperature=moments.granular_temperature,
         pressure=moments.pressure,
@@ -175,8 +159,7 @@ def corrected_shear(
         shear_stress_stderr=moments.shear_stress * of_shear,
         correlation_length=length,
         pair_factor=pairs,
-        extrapolated=outside(alpha, laws.restitution_range)
-        | outside(nu, laws.packing_fraction_range),
+        extrapolated=_outside(alpha, RESTITUTION_RANGE) | _outside(nu, PACKING_FRACTION_RANGE),
     )
 
 
@@ -194,3 +177,9 @@ def pair_factor(laws: CorrelationLaws, alpha: Numbers, nu: Numbers) -> Array:
     return (1 + laws.pairs[0] * loss**5) * (
         1 + laws.pairs[1] * jnp.cbrt(loss) * crowding ** laws.pairs[2]
     )
+
+
+def _outside(value: Array, span: tuple[float, float]) -> Bool[Array, "..."]:
+    """Whether a number is outside the range (2,) of a law, beyond rounding."""
+    slack = 8 * jnp.finfo(value.dtype).eps
+    return (value < span[0] - slack) | (value > span[1] + slack)
