@@ -183,7 +183,6 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing_behind(
         "map --grains auto": "--grains auto requires --error.",
         f"{FLOW} --timestep abc": "'--timestep': must be auto",
         "where --restitution 0.7 --packing-fraction 0.9": "--packing-fraction must be between",
-        "where --csv": "--csv and --json exclude each other",
         "info --draw": "No such option: --draw",
     }.items(),
 )

@@ -154,6 +154,12 @@ def earlier(data: xr.DataTree) -> xr.DataTree:
     return data
 
 
+def without_a_sum(data: xr.DataTree) -> xr.DataTree:
+    """The map with a running sum less, as of another version."""
+    data["sums"] = data["sums"].to_dataset().isel(quantity=slice(-1))
+    return data
+
+
 def other_sources(data: xr.DataTree) -> xr.DataTree:
     data.attrs["code_digest"] = "other"
     return data
@@ -179,6 +185,7 @@ REFUSED: dict[str, Any] = {
         of_seeds(x, 1, 1),
     ],
     "must have the group sums": lambda x: [of_seeds({}, 0, 1)],
+    "the running sums of this version": lambda x: [without_a_sum(of_seeds(x, 0, 1))],
     "a list of at least one map": lambda _: [],
     "a list of at least one map or file, not 'map.nc'": lambda _: "map.nc",
 }

@@ -1,7 +1,5 @@
 """The command ``where``: what kinetic theory can predict in a flow, without a simulation."""
 
-import csv as comma_separated
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -36,7 +34,6 @@ WHERE_OPTIONS = {
     ),
     "factors": Option("Print the factor of each assumption of the theory.", bool),
     "corrected": Option("Also print the theory with measured correlations.", bool),
-    "csv": Option("Print CSV, a line for each pair.", bool),
     "json": JSON,
     "law": Option(
         "Write the constitutive law, at the given values or over the range of the map.",
@@ -54,15 +51,12 @@ def run_where_command(
     packing_fraction: Sequence[float] | None = None,
     factors: bool = False,
     corrected: bool = False,
-    csv: bool = False,
     json: bool = False,
     law: Path | None = None,
     overwrite: bool = False,
 ) -> None:
-    if csv and json:
-        raise InputError("`csv` and `json` exclude each other.", field="csv")
     no_pair = restitution is None or packing_fraction is None
-    if no_pair and (law is None or csv or json):
+    if no_pair and (law is None or json):
         raise InputError("`restitution` and `packing_fraction` are required, or `law` alone.")
     if law is not None:
         from jaxgran.io.paths import require_place
@@ -76,9 +70,7 @@ def run_where_command(
     plane = np.meshgrid(restitution, packing_fraction)
     is_point = plane[0].size == 1
     flow = validity(*(x.item() if is_point else x for x in plane))
-    if csv:
-        _print_csv(_entries(flow))
-    elif json:
+    if json:
         axes = {"restitution": restitution, "packing_fraction": packing_fraction}
         entries = _entries(flow)
         entries |= {
@@ -137,20 +129,6 @@ def _print_source() -> None:
     table = shipped_table()
     theory = THEORIES[table.head["theory"]]
     print_text(f"Reference map: {table.made_with}. Kinetic theory: {theory}.")
-
-
-def _print_csv(entries: dict[str, Entry]) -> None:
-    """Print a line for each pair, with the columns NAME and, where there is one, NAME_ci95."""
-    columns = {}
-    for name, entry in entries.items():
-        columns[name] = entry.value
-        if entry.ci95 is not None:
-            columns[f"{name}_ci95"] = entry.ci95
-    columns["verdict"] = columns.pop("verdict")  # last, as it is long
-    lines = np.broadcast_arrays(*columns.values())
-    writer = comma_separated.writer(sys.stdout, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*(x.ravel().tolist() for x in lines), strict=True))
 
 
 def _entries(flow: Validity) -> dict[str, Entry]:

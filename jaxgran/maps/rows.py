@@ -2,6 +2,7 @@
 and back.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -9,7 +10,7 @@ import jax
 import numpy as np
 import xarray as xr
 
-from jaxgran.dynamics.tally import flat_tally, tally_from_flat
+from jaxgran.dynamics.tally import empty_tally, flat_tally, tally_from_flat
 from jaxgran.maps.own_observables import sums_by_name
 from jaxgran.maps.replica import AXES, Replica, ReplicaId
 from jaxgran.maps.schema import flag_names, flattened
@@ -92,6 +93,10 @@ def replicas_of(data: xr.DataTree, settings: MapSettings) -> Iterator[Replica]:
     """
     whole, dtype = _with_all_axes(data), np.dtype(str(data.attrs["precision"]))
     names = flag_names(whole["sums/status"])
+    own_sums = sums_by_name(settings)
+    leaves = jax.tree.leaves((empty_tally(dtype), own_sums))
+    if whole.sizes["quantity"] != sum(math.prod(leaf.shape) for leaf in leaves):
+        raise InputError("data must have the running sums of this version and of `observe`.")
     arrays = {name: whole[f"sums/{name}"].values for name in SUMS}
     fields = [f"states/{name}" for name in FIELDS if f"states/{name}" in whole]
     states = {path.partition("/")[2]: whole[path].values for path in fields}
