@@ -68,7 +68,9 @@ BENCHMARKS = (
         (
             "paper.nc",
             *("paper_curves.png", "paper_contours.png", "paper_theory.png", "paper_factors.png"),
+            "paper_mean_mass.json",
         ),
+        (Option("--mean-mass", "compare with the ratio by the paper's mass", bool),),
     ),
     Benchmark(
         "paper_claims",
