@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.animation import FFMpegWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -20,16 +19,7 @@ from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.files import atomic_write
 from jaxgran.io.paths import require_place
 from jaxgran.model.checks import InputError, short_repr
-from jaxgran.plotting.encoding import BINARY_COLOUR
-from jaxgran.plotting.flow import (
-    COLOURS,
-    common_scale,
-    draw_flow,
-    force_key,
-    network_of,
-    show_flow,
-    title_of,
-)
+from jaxgran.plotting.flow import common_scale, draw_flow, force_key, network_of, title_of
 from jaxgran.plotting.style import empty_figure, styled
 
 MOST_DRAWN = 500  # frames of a movie, which are held in memory while it is written
@@ -38,7 +28,7 @@ _MARGIN = 0.1  # inches, around a flow
 _HEAD, _FOOT = 0.4, 0.3  # inches, of the titles above and the legend below
 _DPI = 96  # pixels per inch
 _FRAMES_PER_SECOND = 12
-_SHADES = 8, 12, 4, 4  # colours of each ramp in the palette of a GIF; more make a larger file
+_COLOURS = 48  # of a GIF; more make a larger file
 _Follow = Callable[[Sequence], Iterable]  # passes items on, and may report how many are done
 
 
@@ -114,54 +104,34 @@ def write_movie(path: Path, *flows: Frames, follow: _Follow = iter) -> None:
     figure = empty_figure(len(flows) * panel, panel + _HEAD + _FOOT)
     figure.set_layout_engine("none")  # a fixed layout, so that only the flow moves
     figure.set_dpi(_DPI)
+    drawings = _drawings(figure, flows, follow)
     with atomic_write(path) as temporary:
-        if path.suffix == ".gif":
-            palette = _palette()
-            first, *others = [
-                Image.fromarray(pixels[..., :3]).quantize(palette=palette, dither=Image.Dither.NONE)
-                for pixels in _drawings(figure, flows, follow)
-            ]
-            duration = 1000 // _FRAMES_PER_SECOND
-            first.save(temporary, save_all=True, append_images=others, duration=duration, loop=0)
-        else:
+        if path.suffix == ".mp4":
             writer = FFMpegWriter(_FRAMES_PER_SECOND)
             with writer.saving(figure, str(temporary), _DPI):
-                for _ in _drawings(figure, flows, follow):
+                for _ in drawings:
                     writer.grab_frame()
+            return
+        first, *others = (Image.fromarray(pixels[..., :3]) for pixels in drawings)
+        palette = first.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE)  # keeps rare colours
+        images = [x.quantize(palette=palette, dither=Image.Dither.NONE) for x in others]
+        duration = 1000 // _FRAMES_PER_SECOND
+        palette.save(temporary, save_all=True, append_images=images, duration=duration, loop=0)
 
 
 def _drawings(figure: Figure, flows: Sequence[Frames], follow: _Follow) -> Iterator[np.ndarray]:
     """The pixels of each frame, (height, width, 4)."""
     canvas, (width, height) = FigureCanvasAgg(figure), figure.get_size_inches()
-    panel, panels = width / len(flows), []
-    for k, frames in enumerate(flows):
-        left = (k * panel + _MARGIN) / width
+    panel, scales, grid = width / len(flows), [], []
+    for k, flow in enumerate(flows):
+        left, low = (k * panel + _MARGIN) / width, (_FOOT + _MARGIN) / height
         size = (panel - 2 * _MARGIN) / width, (panel - 2 * _MARGIN) / height
-        axes = figure.add_axes((left, (_FOOT + _MARGIN) / height, *size))
-        scale = common_scale([frame.network for frame in frames.frames], "speed")
-        panels.append((axes, draw_flow(axes, frames.frames[0].network, "speed", scale), scale))
-    figure.legend(handles=force_key(panels[0][2])[:2], loc="lower center", ncols=2)
-    for moment in follow(list(zip(*(frames.frames for frames in flows), strict=True))):
-        for (axes, artists, scale), frame in zip(panels, moment, strict=True):
-            show_flow(artists, frame.network, "speed", scale)
+        grid.append(figure.add_axes((left, low, *size)))
+        scales.append(common_scale(frame.network for frame in flow.frames))
+    figure.legend(handles=force_key(scales[0])[:2], loc="lower center", ncols=2)
+    for moment in follow(list(zip(*(flow.frames for flow in flows), strict=True))):
+        for axes, frame, scale in zip(grid, moment, scales, strict=True):
+            draw_flow(axes, frame.network, scale)
             axes.set_title(frame.title)
         canvas.draw()
-        yield np.asarray(canvas.buffer_rgba())
-
-
-def _palette() -> Image.Image:
-    """The colours of grains, bars and text, fixed for all frames so that rare colours are kept."""
-    ramps = (
-        LinearSegmentedColormap.from_list("grey", ["white", "black"]),
-        COLOURS["speed"],
-        *(
-            LinearSegmentedColormap.from_list("bar", [BINARY_COLOUR, end])
-            for end in ("white", COLOURS["speed"](1.0))
-        ),
-    )
-    shades = np.concatenate(
-        [ramp(np.linspace(0, 1, n))[:, :3] for ramp, n in zip(ramps, _SHADES, strict=True)]
-    )
-    palette = Image.new("P", (1, 1))
-    palette.putpalette(np.round(255 * shades).astype(np.uint8).tobytes())
-    return palette
+        yield np.array(canvas.buffer_rgba())
