@@ -166,11 +166,11 @@ def test_too_many_frames_are_thinned_evenly(monkeypatch) -> None:
     snapshot = seen_once(0)
     for step in range(50):
         frames.keep(snapshot, step)
-    strains = [frame.strain for frame in frames.frames]
+    strains = [float(title.split("strain ")[1].split("\n")[0]) for _, title in frames.frames]
     assert 4 <= len(strains) <= 8
-    assert len(set(np.diff(strains))) == 1 and strains[0] == 0
+    assert np.ptp(np.diff(strains)) < 1.5e-3 and strains[0] == 0  # three digits
     frames.keep(snapshot, 0)
-    assert [frame.strain for frame in frames.frames] == [0.0]
+    assert len(frames) == 1
 
 
 def test_a_movie_that_is_interrupted_leaves_the_old_file(tmp_path: Path) -> None:

@@ -88,6 +88,8 @@ function drawCurve(id, cells, places, label, title) {
   const [value, error, theory] = [view.value, view.error, view.theory].map(pick);
   const bad = cells.map((k, place) => (data.bad[k + firstPoint()] ? value[place] : null));
   const chosenPlace = cells.indexOf(chosenCell());
+  const positive = value.filter((v) => v > 0), span = Math.max(...positive) / Math.min(...positive);
+  const dtick = span > 100 ? 1 : span > 4 ? "D2" : undefined; // decades, 1, 2 and 5, or Plotly's own
   const traces = [{
     ...SCATTER, mode: "lines+markers", name: "measured", x: places, y: value, customdata: cells,
     text: cells.map((k) => hoverText(k + firstPoint())), hoverinfo: "text", showlegend: true,
@@ -97,7 +99,7 @@ function drawCurve(id, cells, places, label, title) {
   { ...SCATTER, name: "chosen point", x: [places[chosenPlace]], y: [value[chosenPlace]], marker: diamond(16) }];
   if (theory) traces.splice(1, 0, { ...SCATTER, mode: "lines", name: "kinetic theory", x: places, y: theory, line: { color: colour("theory"), dash: "dash" }, showlegend: true });
   draw(id, traces, { title: { text: label } }, {
-    title: { text: escaped(view.label).replace(" / ", "<br>/ ") }, exponentformat: "power", type: chosen.log ? "log" : "linear",
+    title: { text: escaped(view.label).replace(" / ", "<br>/ ") }, exponentformat: "power", ...(chosen.log ? { type: "log", dtick } : {}),
   }, {
     title: { text: title, font: { size: 14 }, x: 0.02, xanchor: "left" },
     legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 1, xanchor: "right", font: { size: 12 } },

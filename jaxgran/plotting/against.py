@@ -18,8 +18,7 @@ from jaxgran.plotting.style import (
     RATIO_LABEL,
     TWO_COLUMNS,
     add_curve_legend,
-    curve_styles,
-    draw_points,
+    draw_curves,
     draw_reference,
     empty_figure,
     label_log_axis,
@@ -42,10 +41,6 @@ def ratio_against_timestep(data: MapData) -> Figure:
 
     Args:
       data: as in :func:`ratio_curves`, with a dimension `timestep` in units of 1/γ̇.
-
-    Returns:
-      Error bars are one standard error; a point whose status is not `ok` is an open symbol in a
-      ring.
 
     Raises:
       InputError: (a ValueError) fewer than two time steps.
@@ -75,8 +70,7 @@ def averages_against_grains(data: MapData) -> Figure:
 
     Returns:
       Error bars are the standard error of each value, also of the one at the largest N, in units of
-      that one. A point whose status is not `ok` is an open symbol in a ring. Symbols of different
-      curves are moved apart a little.
+      that one. Symbols of different curves are moved apart a little.
 
     Raises:
       InputError: (a ValueError) fewer than two numbers of grains.
@@ -134,11 +128,10 @@ def _draw_curves(
     """Draw a quantity of all flows along a dimension, or its quotient with the last value."""
     draw_reference(axes)
     axes.set_xscale("log")
-    x, bad, values = flows[along].values, suspect(flows), flows[name].values
-    errors, middle = flows[f"{name}_stderr"].values, (len(values) - 1) / 2
-    for k, style in enumerate(curve_styles(len(values))):
-        unit = abs(values[k, -1]) if relative else 1.0
-        apart = 1.03 ** (k - middle) if relative else 1.0
-        draw_points(axes, x * apart, values[k] / unit, bad[k], style, yerr=errors[k] / unit)
+    x, values, errors = flows[along].values, flows[name].values, flows[f"{name}_stderr"].values
+    unit = abs(values[:, -1:]) if relative else 1.0
+    order = np.arange(len(values))[:, None] - (len(values) - 1) / 2
+    apart = 1.03**order if relative else 1.0
+    draw_curves(axes, x * apart, values / unit, suspect(flows), yerr=errors / unit)
     margin = (x.max() / x.min()) ** 0.08
     axes.set_xlim(x.min() / margin, x.max() * margin)

@@ -83,10 +83,6 @@ def enskog_factors(data: MapData) -> Figure:
       data: a map with `theory/enskog_factor_pressure_...` and `force_ratio`, with `_stderr`, the
         temperatures and pressures of flow and theory, and `status`. The largest of several numbers
         of grains and the shortest of several time steps are drawn.
-
-    Returns:
-      Error bars are one standard error; a point whose status is not `ok` is an open symbol in a
-      ring.
     """
     data = with_temperature(plane(data, *_NEEDED))
     count = data.sizes["restitution"]

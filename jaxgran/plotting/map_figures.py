@@ -20,8 +20,7 @@ from jaxgran.plotting.selection import is_plane, points
 from jaxgran.plotting.style import FILE_DPI, write
 from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
 
-# bytes of a stem; file systems accept 255, and the names of figures are longer than their stem
-_LONGEST_NAME = 200
+_LONGEST_NAME = 200  # bytes of a stem; file systems accept 255, with the rest of the name
 
 
 class MapFigure(NamedTuple):
@@ -64,15 +63,13 @@ def save_figures(
     file                     function                    written if the map has
     =======================  ==========================  ===========================================
     `{stem}_curves.png`      `ratio_curves`              always
-    `{stem}_contours.png`    `ratio_contours`            at least two restitutions and two packing
-                                                         fractions
-    `{stem}_timestep.png`    `ratio_against_timestep`    at least two time steps
-    `{stem}_size.png`        `averages_against_grains`   at least two numbers of grains
-    `{stem}_theory.png`      `theory_errors`             a plane as for the contours, and the
-                                                         predictions of the theory
-    `{stem}_factors.png`     `enskog_factors`            two packing fractions, and the factors of
-                                                         the error of the theory
-    `{stem}_clusters.png`    `cluster_shares`            the shares of the clusters
+    `{stem}_contours.png`    `ratio_contours`            two restitutions and two packing fractions
+    `{stem}_timestep.png`    `ratio_against_timestep`    two time steps
+    `{stem}_size.png`        `averages_against_grains`   two numbers of grains
+    `{stem}_theory.png`      `theory_errors`             as for the contours, and predictions
+    `{stem}_factors.png`     `enskog_factors`            two packing fractions, and factors of the
+                                                         error of the theory
+    `{stem}_clusters.png`    `cluster_shares`            shares of clusters
     =======================  ==========================  ===========================================
 
     Args:

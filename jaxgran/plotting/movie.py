@@ -6,11 +6,11 @@ largest speed and the largest force known, which set the scale of colours and wi
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.animation import FFMpegWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -19,7 +19,15 @@ from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.files import atomic_write
 from jaxgran.io.paths import require_place
 from jaxgran.model.checks import InputError, short_repr
-from jaxgran.plotting.flow import common_scale, draw_flow, force_key, network_of, title_of
+from jaxgran.plotting.flow import (
+    BINARY_COLOUR,
+    SPEED_COLOURS,
+    common_scale,
+    draw_flow,
+    force_key,
+    network_of,
+    title_of,
+)
 from jaxgran.plotting.style import empty_figure, styled
 
 MOST_DRAWN = 500  # frames of a movie, which are held in memory while it is written
@@ -28,16 +36,8 @@ _MARGIN = 0.1  # inches, around a flow
 _HEAD, _FOOT = 0.4, 0.3  # inches, of the titles above and the legend below
 _DPI = 96  # pixels per inch
 _FRAMES_PER_SECOND = 12
-_COLOURS = 48  # of a GIF; more make a larger file
+_SHADES = 10  # of each colour in a GIF; more make a larger file
 _Follow = Callable[[Sequence], Iterable]  # passes items on, and may report how many are done
-
-
-class Frame(NamedTuple):
-    """A flow at one time."""
-
-    network: ForceNetwork
-    title: str
-    strain: float  # since the first frame
 
 
 class Frames:
@@ -50,12 +50,8 @@ class Frames:
 
     def __init__(self, title: str | None = None):
         self.title = title
-        self._begin()
-
-    def _begin(self) -> None:
-        self.frames: list[Frame] = []
-        self._recorded = 0  # frames
-        self._stride = 1  # recorded frames per frame kept
+        self.frames: list[tuple[ForceNetwork, str]] = []  # flows and titles
+        self._recorded, self._stride = 0, 1  # frames recorded, in all and for each that is kept
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -65,14 +61,13 @@ class Frames:
         dropped.
         """
         if step == 0:
-            self._begin()
+            self.frames, self._recorded, self._stride = [], 0, 1
         if len(self.frames) == MOST_DRAWN:
             self.frames, self._stride = self.frames[::2], 2 * self._stride
         if self._recorded % self._stride == 0:
             per_step = (np.asarray(seen.timestep) * np.asarray(seen.shear_rate)).flat[0].item()
-            strain = step * per_step
-            title = title_of(seen, strain) if self.title is None else self.title
-            self.frames.append(Frame(network_of(seen), title, strain))
+            title = title_of(seen, step * per_step) if self.title is None else self.title
+            self.frames.append((network_of(seen), title))
         self._recorded += 1
 
 
@@ -112,11 +107,13 @@ def write_movie(path: Path, *flows: Frames, follow: _Follow = iter) -> None:
                 for _ in drawings:
                     writer.grab_frame()
             return
-        first, *others = (Image.fromarray(pixels[..., :3]) for pixels in drawings)
-        palette = first.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE)  # keeps rare colours
-        images = [x.quantize(palette=palette, dither=Image.Dither.NONE) for x in others]
+        palette, no_dither = _palette(), Image.Dither.NONE
+        first, *others = (
+            Image.fromarray(pixels[..., :3]).quantize(palette=palette, dither=no_dither)
+            for pixels in drawings
+        )
         duration = 1000 // _FRAMES_PER_SECOND
-        palette.save(temporary, save_all=True, append_images=images, duration=duration, loop=0)
+        first.save(temporary, save_all=True, append_images=others, duration=duration, loop=0)
 
 
 def _drawings(figure: Figure, flows: Sequence[Frames], follow: _Follow) -> Iterator[np.ndarray]:
@@ -127,11 +124,22 @@ def _drawings(figure: Figure, flows: Sequence[Frames], follow: _Follow) -> Itera
         left, low = (k * panel + _MARGIN) / width, (_FOOT + _MARGIN) / height
         size = (panel - 2 * _MARGIN) / width, (panel - 2 * _MARGIN) / height
         grid.append(figure.add_axes((left, low, *size)))
-        scales.append(common_scale(frame.network for frame in flow.frames))
+        scales.append(common_scale(network for network, _ in flow.frames))
     figure.legend(handles=force_key(scales[0])[:2], loc="lower center", ncols=2)
     for moment in follow(list(zip(*(flow.frames for flow in flows), strict=True))):
-        for axes, frame, scale in zip(grid, moment, scales, strict=True):
-            draw_flow(axes, frame.network, scale)
-            axes.set_title(frame.title)
+        for axes, (network, title), scale in zip(grid, moment, scales, strict=True):
+            draw_flow(axes, network, scale)
+            axes.set_title(title)
         canvas.draw()
         yield np.array(canvas.buffer_rgba())
+
+
+def _palette() -> Image.Image:
+    """The colours of grains, text and bars, fixed for all frames so that rare colours are kept."""
+    inks = [LinearSegmentedColormap.from_list(x, [x, "white"]) for x in ("black", BINARY_COLOUR)]
+    shades = [
+        ramp(np.linspace(0, 1, _SHADES), bytes=True)[:, :3] for ramp in (SPEED_COLOURS, *inks)
+    ]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.concatenate(shades).tobytes())
+    return palette

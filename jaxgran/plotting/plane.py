@@ -42,9 +42,9 @@ Legend = dict[str, Artist]  # entries by their labels
 _SUBDIVISIONS = 12  # steps of the interpolation between neighbouring points
 _LINEAR_BELOW = 0.01  # excess below which its contour variable is linear, above it logarithmic
 _LEAST_HALF_WIDTH = 1e-3  # of a band, in units of its field
-_LEAST_ROOM = 0.045  # inches around a label
+_LEAST_ROOM = 0.045  # inches from a label to the next contour and to the frame
 _LETTER = 0.078  # inches, width of a letter of a label
-_RING_RADIUS = 0.05  # inches
+_RING_RADIUS = 0.09  # inches, with some room
 _POINT: dict[str, Any] = {"linestyle": "none", "color": "0.25"}
 _DOT = _POINT | {"marker": "o", "markersize": 2, "markeredgewidth": 0, "label": "measured"}
 _CROSS = _POINT | {"marker": "x", "markersize": 5, "label": "no value"}
@@ -103,7 +103,7 @@ def draw_plane(
     x, y = 1.0 - data.restitution.values, data.packing_fraction.values
     points, values = np.stack(np.meshgrid(x, y)), list(levels.values())
     fine, (smooth, low, high) = (refined(x), refined(y)), map(refined, fields)
-    axes.set(xlim=padded(x), ylim=padded(y))
+    axes.set(xlim=padded(x), ylim=padded(y), xlabel=ALPHA_LABEL, ylabel=NU_LABEL)
     axes.contourf(*fine, smooth, [-1e9, *values, 1e9], colors=shades, zorder=1)
     legend: Legend = {}
     measured, bad = np.isfinite(fields[0]), suspect(data)
@@ -152,14 +152,6 @@ def draw_binary_limit(axes: Axes, data: xr.Dataset) -> Legend:
     return {label: Line2D([], [], **_BINARY, label=label)}
 
 
-def label_axes(grid: np.ndarray) -> None:
-    """Name the axes of panels (rows, columns) at the left and at the bottom."""
-    for axes in grid[-1]:
-        axes.set_xlabel(ALPHA_LABEL)
-    for axes in grid[:, 0]:
-        axes.set_ylabel(NU_LABEL)
-
-
 def add_plane_legend(figure: Figure, legend: Legend) -> None:
     """Explain above the panels what is drawn in them."""
     rows = math.ceil(len(legend) / figure.get_figwidth())
@@ -178,27 +170,27 @@ def add_plane_legend(figure: Figure, legend: Legend) -> None:
 
 
 def _label(axes: Axes, drawn: QuadContourSet, texts: list[str], rings: np.ndarray) -> None:
-    """Label each contour where it has most room between the others, the labels, rings and frame.
+    """Label each contour where it is farthest from the others and the frame, and not at a ring.
 
-    A contour without room has no label.
+    Contours with the least room come first; one without room has no label.
     """
     to_inches = axes.transData - axes.figure.dpi_scale_trans
     low, high = (axes.transAxes - axes.figure.dpi_scale_trans).transform([(0, 0), (1, 1)])
     rings, labels = to_inches.transform(rings.reshape(-1, 2)), np.empty((0, 2))
     vertices = (np.reshape(path.vertices, (-1, 2)) for path in drawn.get_paths())
     curves = [to_inches.transform(points[:: 1 + len(points) // 200]) for points in vertices]
-    half = _LETTER * max(map(len, texts)) / 2
-    for k, curve in enumerate(curves):
-        room = np.minimum.reduce(
-            [
-                _distance(curve, np.concatenate([labels[:0], *curves[:k], *curves[k + 1 :]])),
-                _distance(curve, labels) - 2 * half,
-                _distance(curve, rings) - half - _RING_RADIUS,
-                np.minimum(curve - low, high - curve).min(axis=1) - half,
-            ]
-        )
+    halves = [_LETTER * len(text) / 2 for text in texts]
+    rooms = []
+    for k, (curve, half) in enumerate(zip(curves, halves, strict=True)):
+        others = np.concatenate([labels, *curves[:k], *curves[k + 1 :]])
+        to_frame = np.minimum(curve - low, high - curve).min(axis=1)
+        fits = (to_frame > half + _LEAST_ROOM) & (_distance(curve, rings) > half + _RING_RADIUS)
+        rooms.append(np.where(fits, np.minimum(_distance(curve, others), to_frame / 2), 0.0))
+    for k in sorted(range(len(curves)), key=lambda k: rooms[k].max(initial=0)):
+        free = _distance(curves[k], labels) > halves[k] + max(halves)
+        room = np.where(free, rooms[k], 0.0)
         if room.max(initial=0) > _LEAST_ROOM:
-            labels = np.vstack([labels, curve[room.argmax()]])
+            labels = np.vstack([labels, curves[k][room.argmax()]])
     places = list(map(tuple, to_inches.inverted().transform(labels)))
     names = dict(zip(drawn.levels, texts, strict=True))
     style = {"fontsize": SMALL_SIZE, "inline_spacing": 2, "zorder": 6}

@@ -19,7 +19,6 @@ from jaxgran.plotting.plane import (
     add_plane_legend,
     contour_variable,
     draw_plane,
-    label_axes,
 )
 from jaxgran.plotting.selection import describe, plane, require_plane, suspect
 from jaxgran.plotting.style import (
@@ -29,8 +28,7 @@ from jaxgran.plotting.style import (
     RATIO_LABEL,
     TWO_COLUMNS,
     add_curve_legend,
-    curve_styles,
-    draw_points,
+    draw_curves,
     draw_reference,
     empty_figure,
     label_log_axis,
@@ -54,7 +52,8 @@ def ratio_curves(data: MapData) -> Figure:
 
     Returns:
       Two panels with one scale, or one where the map has no `stress_ratio`. Error bars are one
-      standard error; a point whose status is not `ok` is an open symbol in a ring.
+      standard error, and a point whose status is not `ok` is an open symbol in a ring, in all
+      figures of a map.
 
     Raises:
       InputError: (a ValueError) the data are not a map.
@@ -68,8 +67,7 @@ def ratio_curves(data: MapData) -> Figure:
     nu, bad = data.packing_fraction.values, suspect(data)
     for axes, letter, (label, (ratio, error)) in zip(grid, "ab", panels.items(), strict=False):
         draw_reference(axes)
-        for k, style in enumerate(curve_styles(data.sizes["restitution"])):
-            draw_points(axes, nu, ratio.values[:, k], bad[:, k], style, yerr=error.values[:, k])
+        draw_curves(axes, nu, ratio.values.T, bad.T, yerr=error.values.T)
         axes.xaxis.set_major_locator(MaxNLocator(8, steps=(1, 2, 5, 10)))  # more would touch
         ylabel = f"({letter}) {label}" if len(panels) > 1 else label
         axes.set(xlim=padded(nu), xlabel=NU_LABEL, ylabel=ylabel)
@@ -120,7 +118,6 @@ def ratio_contours(data: MapData) -> Figure:
     fields = [contour_variable(excess + k * error) for k in (0.0, -1.0, 1.0)]
     greys = [str(value) for value in np.linspace(1.0, 0.8, len(levels) + 1)]
     legend = draw_plane(axes, data, fields, levels, greys)
-    label_axes(np.array([[axes]]))
     add_plane_legend(figure, legend)
     reached = np.nanmin(excess, initial=np.inf), np.nanmax(excess, initial=-np.inf)
     absent = [f"{level:.2f}" for level in EXCESS_LEVELS if not reached[0] < level < reached[1]]

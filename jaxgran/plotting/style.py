@@ -174,6 +174,16 @@ def draw_points(
         axes.plot(x[bad], y[bad], **RING, zorder=5)
 
 
+def draw_curves(
+    axes: Axes, x: np.ndarray, y: np.ndarray, bad: np.ndarray, **errors: np.ndarray
+) -> None:
+    """Draw curves (curves, points) with their error bars in the order of ``curve_styles``."""
+    x = np.broadcast_to(x, y.shape)
+    for k, style in enumerate(curve_styles(len(y))):
+        bars = {name: error[k] for name, error in errors.items()}
+        draw_points(axes, x[k], y[k], bad[k], style, **bars)
+
+
 def add_curve_legend(figure: Figure, labels: Sequence[str], title: str, bad: Any) -> None:
     """Name the curves, in the order of ``curve_styles``, and the ring if there is any."""
     styles = zip(labels, curve_styles(len(labels)), strict=True)

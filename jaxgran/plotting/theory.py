@@ -20,15 +20,13 @@ from jaxgran.plotting.plane import (
     add_plane_legend,
     draw_binary_limit,
     draw_plane,
-    label_axes,
 )
 from jaxgran.plotting.selection import describe, is_plane, plane, require_plane, suspect
 from jaxgran.plotting.style import (
     ALPHA_TITLE,
     TWO_COLUMNS,
     add_curve_legend,
-    curve_styles,
-    draw_points,
+    draw_curves,
     empty_figure,
     label_log_axis,
     styled,
@@ -134,7 +132,7 @@ def theory_errors(data: MapData) -> Figure:
         legend |= draw_plane(axes, data, fields, ERROR_LEVELS, tints)
         legend |= draw_binary_limit(axes, data)
         axes.set_title(f"({letter}) {_QUANTITIES[quantity]}: {titles[part]}")
-    label_axes(grid)
+        axes.label_outer()
     add_plane_legend(figure, legend)
     total = error_parts(data, "pressure")["total"][0]
     wrong = abs(np.expm1(total)) > 0.1
@@ -159,23 +157,18 @@ def theory_errors(data: MapData) -> Figure:
 @styled
 def cluster_shares(data: MapData) -> Figure:
     """Return the share of the contact pressure that clusters of three or more grains carry, against
-    the excess of the force ratio.
+    the excess of the force ratio, one curve per restitution.
 
     Args:
       data: a map with `stresses/cluster_pressure_share` and `force_ratio`, with `_stderr`, and
         `status`.
-
-    Returns:
-      Error bars are one standard error, in both directions; symbols differ by restitution.
     """
     data = plane(data, *CLUSTERS)
     excess, share, bad = data.force_ratio.values - 1.0, data[_SHARE].values, suspect(data)
     x_error, y_error = data.force_ratio_stderr.values, data[f"{_SHARE}_stderr"].values
     figure = empty_figure(TWO_COLUMNS, height=2.9)
     axes = figure.add_subplot(ylim=(-0.03, 1.03), ylabel="share of pressure in clusters")
-    for k, style in enumerate(curve_styles(data.sizes["restitution"])):
-        errors = {"xerr": x_error[:, k], "yerr": y_error[:, k]}
-        draw_points(axes, excess[:, k], share[:, k], bad[:, k], style, **errors)
+    draw_curves(axes, excess.T, share.T, bad.T, xerr=x_error.T, yerr=y_error.T)
     shown = excess >= _LEAST_EXCESS
     limits = (excess[shown].min() / 1.6, excess[shown].max() * 1.6) if shown.any() else (1e-5, 1)
     label = r"excess of the force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle-1$"
