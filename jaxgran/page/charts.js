@@ -88,7 +88,8 @@ function drawCurve(id, cells, places, label, title) {
   const [value, error, theory] = [view.value, view.error, view.theory].map(pick);
   const bad = cells.map((k, place) => (data.bad[k + firstPoint()] ? value[place] : null));
   const chosenPlace = cells.indexOf(chosenCell());
-  const positive = value.filter((v) => v > 0), span = Math.max(...positive) / Math.min(...positive);
+  const positive = [...value, ...(theory ?? [])].filter((v) => v > 0);
+  const span = Math.max(...positive) / Math.min(...positive);
   const dtick = span > 100 ? 1 : span > 4 ? "D2" : undefined; // decades, 1, 2 and 5, or Plotly's own
   const traces = [{
     ...SCATTER, mode: "lines+markers", name: "measured", x: places, y: value, customdata: cells,
