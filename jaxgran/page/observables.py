@@ -63,7 +63,8 @@ def _observable(data: xr.Dataset, name: str, label: str, place: dict[str, int]) 
     views = [_view(title, value, error, theory)]
     if theory is not None:  # which is that of a large system
         measured, stderr = (value, error) if half is None else (large, half / HALF_INTERVAL)
-        quotients = (x if x is None else x / theory for x in (measured, stderr, theory))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            quotients = [x if x is None else x / theory for x in (measured, stderr, theory)]
         views.append(_view(f"{words} / kinetic theory", *quotients))
     texts = [
         _texts(value, error),
@@ -75,11 +76,12 @@ def _observable(data: xr.Dataset, name: str, label: str, place: dict[str, int]) 
     return {"label": title, "meaning": meaning, "texts": texts, "views": views}
 
 
-def _view(label: str, *columns: np.ndarray | None) -> dict[str, Any]:
+def _view(
+    label: str, value: np.ndarray | None, error: np.ndarray | None, theory: np.ndarray | None
+) -> dict[str, Any]:
     """What is drawn of an observable."""
-    return {"label": label} | dict(
-        zip(("value", "error", "theory"), map(numbers, columns), strict=True)
-    )
+    drawn = {"value": value, "error": error, "theory": theory}
+    return {"label": label} | {name: numbers(column) for name, column in drawn.items()}
 
 
 def _effective_samples(data: xr.Dataset, observable: str) -> np.ndarray | None:
@@ -94,12 +96,8 @@ def column(variable: xr.DataArray, data: xr.Dataset) -> np.ndarray:
     """The values of a variable, or the total of an interval, by point, in order of dimensions."""
     if "error_source" in variable.dims:
         variable = variable.sel(error_source="total")
-    return (
-        variable.broadcast_like(data.force_ratio)
-        .transpose(*DIMENSIONS)
-        .values.astype(float)
-        .ravel()
-    )
+    by_point = variable.broadcast_like(data.force_ratio).transpose(*DIMENSIONS)
+    return by_point.values.astype(float).ravel()
 
 
 def _texts(

@@ -112,7 +112,8 @@ def _flows(data: xr.Dataset, along: str, words: str) -> tuple[xr.Dataset, str]:
         name: np.linspace(0, counts[name] - 1, k).round().astype(int) for name, k in fewer.items()
     }
     shown = [f"{k} of {counts[name]} {name.replace('_', ' ')}s" for name, k in fewer.items()]
-    flows = data.isel(places).stack(flow=("packing_fraction", "restitution"))
+    averages = data[[name for name in data if "/" not in str(name)]].isel(places)
+    flows = averages.stack(flow=("packing_fraction", "restitution"))
     return flows.transpose("flow", along, ...), f"Shown: {', '.join(shown)}" if shown else ""
 
 
