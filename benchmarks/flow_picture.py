@@ -21,7 +21,6 @@ from benchmarks.output import Output
 from jaxgran.analysis.contacts import ForceNetwork, cluster_share, clusters
 from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.plotting.flow import (
-    Colour,
     add_colour_bar,
     common_scale,
     draw_flow,
@@ -51,7 +50,7 @@ class Choice(NamedTuple):
 FULL, QUICK = Choice(324, 1e-4, 20, None), Choice(100, 5e-4, 8, 0.5)
 
 
-def run(output: Output, colour: Colour = "speed") -> None:
+def run(output: Output) -> None:
     """Shear both flows, print what the picture shows, and write JSON and PNG."""
     choice = QUICK if output.quick else FULL
     flows = [window(alpha, choice, choice.steps) for alpha in RESTITUTIONS]
@@ -59,7 +58,7 @@ def run(output: Output, colour: Colour = "speed") -> None:
     for row in rows:
         print(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
     output.write_json("flow", {"nu": PACKING_FRACTION, **choice._asdict(), "flows": rows})
-    output.write_picture(draw([network_of(seen) for seen in flows], colour), "flow")
+    output.write_picture(draw([network_of(seen) for seen in flows]), "flow")
     movies = [movie(*named, choice) for named in zip(RESTITUTIONS, TITLES, strict=True)]
     write_movie(output.path("flow", ".gif"), *movies)
 
@@ -98,14 +97,14 @@ def summary(restitution: float, snapshots: Snapshot) -> dict[str, float]:
 
 
 @styled
-def draw(networks: list[ForceNetwork], colour: Colour) -> Figure:
+def draw(networks: list[ForceNetwork]) -> Figure:
     """The flows beside each other, each in its own scale."""
     figure = empty_figure(TWO_COLUMNS, 3.1)
     handles: list[Patch] = []
     panels = zip(figure.subplots(1, len(networks)), networks, RESTITUTIONS, "ab", strict=True)
     for axes, network, alpha, letter in panels:
-        scale = common_scale([network], colour)
-        add_colour_bar(axes, draw_flow(axes, network, colour, scale), colour)
+        scale = common_scale([network])
+        add_colour_bar(axes, draw_flow(axes, network, scale))
         *handles, widest = force_key(scale)
         axes.set_title(rf"({letter}) $\alpha={alpha:g}$; {widest.get_label()}")
     figure.legend(handles=handles, loc="outside lower center", ncols=2)

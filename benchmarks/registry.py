@@ -138,7 +138,6 @@ BENCHMARKS = (
         "What do the forces between grains look like at restitutions 0.9 and 0.1?",
         (2, 1),
         ("flow.json", "flow.png", "flow.gif"),
-        (Option("--colour", "what colours the grains", choices=("speed", "pressure")),),
     ),
     Benchmark(
         "collapse",

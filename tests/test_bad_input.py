@@ -418,8 +418,9 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "at least two numbers of grains, and this": lambda: jg.averages_against_grains(ratio_dataset()),
     "format must be": lambda: jg.save_figures(ratio_dataset(), "map", format="gif"),
     "dpi must be": lambda: jg.save_figures(ratio_dataset(), "map", dpi=49),
-    "colour must be": lambda: jg.flow_figure(SEEN, "mass"),
-    "it has no number at its points": lambda: jg.explore(ratio_dataset()[["status"]]),
+    "must be a ratio map, and it has no force_ratio": lambda: jg.explore(
+        ratio_dataset()[["status"]]
+    ),
     "movie must be": lambda: check_movie(Path("flow.avi")),
     "trajectory must be": lambda: check_trajectory(Path("flow.nc")),
     "seen must be a flow of finite positions": lambda: jg.flow_figure(

@@ -16,9 +16,9 @@ from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from jaxgran.plotting.encoding import EXCESS_LEVELS
+from jaxgran.page.map_data import map_data
 from jaxgran.plotting.map_figures import save_figures
-from jaxgran.plotting.plane import STANDARD_ERROR
+from jaxgran.plotting.plane import EXCESS_LEVELS, STANDARD_ERROR
 from jaxgran.plotting.ratio import ratio_contours, ratio_curves
 
 
@@ -116,6 +116,14 @@ def test_curves_of_the_shear_stress_ratio_have_a_panel_on_the_scale_of_the_force
             data.stress_ratio_stderr[:, k, 0, 1].values,
         )
         np.testing.assert_allclose(ends, shear[:, None] + error[:, None] * [-1.0, 1.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["restitution", "packing_fraction"])
+def test_a_coordinate_of_one_value_is_drawn_as_an_axis_of_one_value(name: str) -> None:
+    data = with_stress_ratio(ratio_dataset()).isel({name: [2]})
+    drawn, expected = (ratio_curves(x)._repr_png_() for x in (data.squeeze(name), data))
+    assert drawn == expected
+    assert map_data(data.squeeze(name)) == map_data(data)
 
 
 @pytest.mark.parametrize(

@@ -43,59 +43,54 @@ function hoverText(point) {
   return text.map(escaped).join("<br>");
 }
 
+// Plotly's contours of a quantity of the cells, given row by row.
+function contoursOf(heights, further) {
+  const z = y.map((_, row) => heights.slice(row * x.length, (row + 1) * x.length));
+  return { type: "contour", x, y, z, hoverinfo: "skip", connectgaps: false, ...further };
+}
+
 function drawPlane() {
-  const { view, scale, levels } = chosenView(), at = (list, cells) => cells.map((k) => list[k]);
-  const cells = data.headings.slice(0, x.length * y.length).map((_, k) => k);
-  const [cellX, cellY] = [cells.map((k) => x[k % x.length]), cells.map((k) => y[Math.floor(k / x.length)])];
-  const height = cells.map((k) => scale.z[k + firstPoint()]);
-  const isPlane = x.length > 1 && y.length > 1;
+  const view = chosenView(), isPlane = x.length > 1 && y.length > 1;
+  const cells = y.flatMap((_, row) => x.map((_, k) => row * x.length + k));
+  const value = inPart(view.value), heights = chosen.log ? value.map((v) => (v > 0 ? Math.log10(v) : null)) : value;
   const colorbar = {
-    title: { text: escaped(view.label), side: "top" }, outlinewidth: 0, thickness: 14, orientation: "h",
-    y: 1.02, yanchor: "bottom", tickvals: levels.map(([place]) => place), ticktext: levels.map(([, text]) => text),
+    title: { text: escaped(chosen.log ? `log10 of ${view.label}` : view.label), side: "top" },
+    outlinewidth: 0, thickness: 14, orientation: "h", y: 1.02, yanchor: "bottom",
   };
-  const field = {
-    type: "contour", x, y, z: y.map((_, row) => height.slice(row * x.length, (row + 1) * x.length)),
-    colorscale: SHADES, colorbar, hoverinfo: "skip", connectgaps: false, name: "observable",
-    contours: { coloring: "heatmap" }, line: { width: 0 },
-  };
-  const lines = levels.map(([place, text]) => ({
-    ...field, name: `level ${text}`, showscale: false, line: { color: "rgba(40,60,80,0.55)", width: 0.8 },
-    contours: { start: place, end: place, size: 1, coloring: "none", showlabels: !chosen.log, labelfont: { size: 11, color: "#345" } },
-  }));
-  const excess = (chosen.excess && data.excess[part()]) || [];
-  const contours = excess.map((one, k) => ({
-    ...SCATTER, mode: "lines", name: `excess ${one.text}`, x: one.x, y: one.y, line: { color: "#111", width: 1 + 0.6 * k },
-  }));
-  const labelled = excess.filter((one) => one.edge.length);
-  const right = Math.max(...x);
-  const points = (name, chosenCells, marker) => ({ ...SCATTER, name, x: at(cellX, chosenCells), y: at(cellY, chosenCells), marker });
-  const known = (k) => data.bad[k + firstPoint()] && height[k] !== null;
+  const excess = chosen.excess ? inPart(observables[0].views[0].value).map((v) => v && v - 1) : [];
+  const fields = [
+    contoursOf(heights, {
+      name: "observable", colorscale: SHADES, colorbar, ncontours: 12, line: { color: "rgba(40,60,80,0.55)", width: 0.8 },
+      contours: { coloring: "heatmap", showlabels: !chosen.excess, labelfont: { size: 11, color: "#345" } },
+    }),
+    ...data.levels.slice(0, excess.length).map((level, k) => contoursOf(excess, {
+      name: `excess ${level}`, showscale: false, line: { color: "#111", width: 1 + 0.6 * k },
+      contours: { start: level, end: level, size: 1, coloring: "none", showlabels: true, labelfont: { size: 12, color: "#111" } },
+    })),
+  ];
   const dots = isPlane ? { size: 7, color: "#223", line: { color: "white", width: 1 } }
-    : { size: 16, color: height, colorscale: SHADES, colorbar, line: { color: colour("text"), width: 1 } };
+    : { size: 16, color: heights, colorscale: SHADES, colorbar, line: { color: colour("text"), width: 1 } };
+  const points = (name, chosenCells, marker) => ({
+    ...SCATTER, name, x: chosenCells.map((k) => x[k % x.length]), y: chosenCells.map((k) => y[Math.floor(k / x.length)]), marker,
+  });
   draw("plane", [
-    ...(isPlane ? [field, ...lines] : []), ...contours,
-    {
-      ...SCATTER, mode: "text", name: "levels of the excess", cliponaxis: false, textposition: "middle right",
-      x: labelled.map(() => right), y: labelled.map((one) => one.edge[0]), text: labelled.map((one) => ` ${one.text}`), textfont: { size: 12 },
-    },
-    {
-      ...points("points", cells, dots), customdata: cells, text: cells.map((k) => hoverText(k + firstPoint())),
-      hoverinfo: "text",
-    },
-    points("bad status", cells.filter(known), ring(15)),
-    points("no value", cells.filter((k) => height[k] === null), { symbol: "x-thin", size: 11, line: { color: colour("text"), width: 2 } }),
+    ...(isPlane ? fields : []),
+    { ...points("points", cells, dots), customdata: cells, text: cells.map((k) => hoverText(k + firstPoint())), hoverinfo: "text" },
+    points("bad status", cells.filter((k) => data.bad[k + firstPoint()] && value[k] !== null), ring(15)),
+    points("no value", cells.filter((k) => value[k] === null), { symbol: "x-thin", size: 11, line: { color: colour("text"), width: 2 } }),
     points("chosen point", [chosenCell()], diamond(20)),
-  ], { title: { text: "1 − α", standoff: 36 } }, { title: { text: "packing fraction ν" } }, { showlegend: false, margin: { l: 8, r: 40, t: 8, b: 56 } });
+  ], { title: { text: "1 − α", standoff: 36 } }, { title: { text: "packing fraction ν" } }, { showlegend: false, margin: { l: 8, r: 16, t: 8, b: 56 } });
 }
 
 // A curve of the map through the chosen point: its cells and their places along it.
 function drawCurve(id, cells, places, label, title) {
-  const { view } = chosenView(), pick = (list) => list && cells.map((k) => list[k + firstPoint()]);
-  const [value, error, theory] = [view.scales[0].z, view.error, view.theory].map(pick);
+  const view = chosenView(), pick = (list) => list && cells.map((k) => list[k + firstPoint()]);
+  const [value, error, theory] = [view.value, view.error, view.theory].map(pick);
   const bad = cells.map((k, place) => (data.bad[k + firstPoint()] ? value[place] : null));
   const chosenPlace = cells.indexOf(chosenCell());
-  const positive = value.filter((v) => v > 0);
-  const dtick = Math.max(...positive) > 1e2 * Math.min(...positive) ? 1 : "D2"; // decades, or also 2 and 5
+  const positive = [...value, ...(theory ?? [])].filter((v) => v > 0);
+  const span = Math.max(...positive) / Math.min(...positive);
+  const dtick = span > 100 ? 1 : span > 4 ? "D2" : undefined; // decades, 1, 2 and 5, or Plotly's own
   const traces = [{
     ...SCATTER, mode: "lines+markers", name: "measured", x: places, y: value, customdata: cells,
     text: cells.map((k) => hoverText(k + firstPoint())), hoverinfo: "text", showlegend: true,

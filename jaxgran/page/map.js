@@ -5,22 +5,17 @@ const SWITCHES = { quotient: "over kinetic theory", log: "logarithmic", excess: 
 const listOf = Object.fromEntries(choices.map((choice) => [choice.name, choice.texts]));
 const chosen = {
   observable: 0, packing_fraction: y.length >> 1, restitution: x.length >> 1,
-  grains: listOf.grains.length - 1, timestep: 0, levels: 1,
-  quotient: false, log: observables[0].label === "excess", excess: true,
+  grains: listOf.grains.length - 1, timestep: 0,
+  quotient: false, log: true, excess: true,
 };
 
 // A cell is a place in the plane; a point also has a number of grains and a time step.
-const part = () => chosen.grains * listOf.timestep.length + chosen.timestep;
-const firstPoint = () => part() * x.length * y.length;
+const firstPoint = () => (chosen.grains * listOf.timestep.length + chosen.timestep) * x.length * y.length;
+const inPart = (list) => list.slice(firstPoint(), firstPoint() + x.length * y.length);
 const chosenCell = () => chosen.packing_fraction * x.length + chosen.restitution;
 const chosenObservable = () => observables[chosen.observable];
 
-function chosenView() {
-  const { views } = chosenObservable();
-  const view = views[Number(chosen.quotient)] ?? views[0];
-  const scale = view.scales[Number(chosen.log)];
-  return { view, scale, levels: scale.levels[part()][chosen.levels] };
-}
+const chosenView = () => chosenObservable().views[Number(chosen.quotient)] ?? chosenObservable().views[0];
 
 function show() {
   const cell = chosenCell(), point = cell + firstPoint();
@@ -31,7 +26,7 @@ function show() {
   drawCurve("against-alpha", row, x, "1 − α", `ν = ${listOf.packing_fraction[chosen.packing_fraction]}`);
   const flow = data.reference.flows[cell], instant = data.instants?.[point];
   const texts = {
-    which: data.headings[point], status: data.status[point], command: data.again[point],
+    which: data.headings[point], status: data.status[point],
     verdict: flow ? flow.verdict : data.reference.outside,
     "grains-caption": instant ? instant.caption : "This point has no picture.",
   };
@@ -39,7 +34,6 @@ function show() {
   element("status").classList.toggle("bad", data.bad[point]);
   fillTable("numbers", tableRows(point), observables.map((one) => one.meaning));
   fillTable("verdict-numbers", flow ? [data.reference.columns, ...flow.rows] : []);
-  element("again").hidden = !data.again[point];
   element("grains-part").hidden = !data.instants;
   element("grains").hidden = !instant;
   if (instant) drawGrains(element("grains"), instant);
@@ -85,7 +79,7 @@ function fillControls() {
   for (const [name, text] of Object.entries(SWITCHES)) {
     const box = document.createElement("input");
     box.type = "checkbox";
-    add(name, box, text, false).hidden = name === "excess" && !data.excess.length;
+    add(name, box, text, false);
   }
 }
 
@@ -114,13 +108,11 @@ function readAddress() {
   }
 }
 
-function offerCopy(id, text) {
-  element(id).addEventListener("click", async ({ target }) => {
-    const label = target.textContent;
-    await navigator.clipboard.writeText(text());
-    target.textContent = "Copied";
-    setTimeout(() => (target.textContent = label), 1500);
-  });
+async function copyTable({ target }) {
+  const rows = tableRows(chosenCell() + firstPoint()), label = target.textContent;
+  await navigator.clipboard.writeText(rows.map((cells) => cells.join("\t")).join("\n"));
+  target.textContent = "Copied";
+  setTimeout(() => (target.textContent = label), 1500);
 }
 
 async function start() {
@@ -139,8 +131,7 @@ async function start() {
     });
   }
   element("plane").addEventListener("keydown", moveByKey);
-  offerCopy("copy-numbers", () => tableRows(chosenCell() + firstPoint()).map((cells) => cells.join("\t")).join("\n"));
-  offerCopy("copy-command", () => element("command").textContent);
+  element("copy-numbers").addEventListener("click", copyTable);
   addEventListener("hashchange", () => { readAddress(); show(); });
   addEventListener("resize", show);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", show);

@@ -1,5 +1,5 @@
 """Figures from datasets and snapshots. Nothing here starts a simulation.
 
-It imports `maps` and the folders below them. Begin with `ratio`; `drawing` holds what figures
-share.
+It imports `maps` and the folders below them. Begin with `ratio`; `style`, `selection` and `plane`
+hold what figures share.
 """

@@ -10,16 +10,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
-from jaxgran.maps.schema import RATIO, MapData, require_map
+from jaxgran.maps.schema import RATIO, MapData
 from jaxgran.model.checks import InputError
 from jaxgran.plotting.ratio import set_ratio_scale
-from jaxgran.plotting.selection import describe, selection, suspect
+from jaxgran.plotting.selection import describe, points, suspect
 from jaxgran.plotting.style import (
     RATIO_LABEL,
     TWO_COLUMNS,
     add_curve_legend,
-    curve_styles,
-    draw_points,
+    draw_curves,
     draw_reference,
     empty_figure,
     label_log_axis,
@@ -43,21 +42,17 @@ def ratio_against_timestep(data: MapData) -> Figure:
     Args:
       data: as in :func:`ratio_curves`, with a dimension `timestep` in units of 1/γ̇.
 
-    Returns:
-      Error bars are one standard error; a point whose status is not `ok` is an open symbol in a
-      ring.
-
     Raises:
       InputError: (a ValueError) fewer than two time steps.
     """
-    data, chosen = _several_of(data, "timestep", "time steps")
+    flows, chosen = _flows(points(data, *RATIO).isel(grains=-1), "timestep", "time steps")
     figure = empty_figure(TWO_COLUMNS, height=2.6)
     axes = figure.add_subplot(xlabel=r"time step $\dot{\gamma}\,\mathrm{d}t$", ylabel=RATIO_LABEL)
-    _draw_curves(axes, data, "timestep", "force_ratio")
-    set_ratio_scale(axes, data.force_ratio.values)
+    _draw_curves(axes, flows, "timestep", "force_ratio")
+    set_ratio_scale(axes, flows.force_ratio.values)
     label_log_axis(axes.xaxis)
-    _add_legend(figure, data)
-    describe(figure, data, "Force ratio against the time step; bars are standard errors", chosen)
+    _add_legend(figure, flows)
+    describe(figure, flows, "Force ratio against the time step; bars are standard errors", chosen)
     return figure
 
 
@@ -75,85 +70,69 @@ def averages_against_grains(data: MapData) -> Figure:
 
     Returns:
       Error bars are the standard error of each value, also of the one at the largest N, in units of
-      that one. A point whose status is not `ok` is an open symbol in a ring. Symbols of different
-      curves are moved apart a little.
+      that one. Symbols of different curves are moved apart a little.
 
     Raises:
       InputError: (a ValueError) fewer than two numbers of grains.
     """
-    data, chosen = _several_of(data, "grains", "numbers of grains")
-    panels = [name for name in _QUANTITIES if name in data and f"{name}_stderr" in data]
+    flows, chosen = _flows(points(data, *RATIO).isel(timestep=0), "grains", "numbers of grains")
+    panels = [name for name in _QUANTITIES if name in flows and f"{name}_stderr" in flows]
     figure = empty_figure(TWO_COLUMNS, height=2.6)
     grid = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
     for axes, letter, name in zip(grid, "abc", panels, strict=False):
-        _draw_curves(axes, data, "grains", name, relative=True)
+        _draw_curves(axes, flows, "grains", name, relative=True)
         axes.set(xlabel="number of grains $N$", title=f"({letter}) {_QUANTITIES[name]}")
-    sizes = data.grains.values.tolist()
+    sizes = flows.grains.values.tolist()
     grid[0].set_ylabel(f"value over that at $N={sizes[-1]}$")
     grid[0].xaxis.set_major_locator(FixedLocator(sizes, nbins=4))
     grid[0].xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     grid[0].xaxis.set_minor_locator(NullLocator())
-    _add_legend(figure, data)
+    _add_legend(figure, flows)
     message = (
         "How averages depend on the number of grains. Bars are standard errors of each value, also "
         "of that at the largest $N$"
     )
-    describe(figure, data, message, chosen)
+    describe(figure, flows, message, chosen)
     return figure
 
 
-def _several_of(data: MapData, along: str, words: str) -> tuple[xr.Dataset, str]:
-    """Return a map of at most six flows with several values of a dimension, and a sentence that
-    tells of what there were more.
-    """
-    flat = require_map(data, *RATIO)
-    if flat.sizes.get(along, 1) < 2:
+def _flows(data: xr.Dataset, along: str, words: str) -> tuple[xr.Dataset, str]:
+    """Return at most six flows of a map as (flow, ``along``), and a sentence if it has more."""
+    if data.sizes[along] < 2:
         raise InputError(
-            f"this figure needs at least two {words}, and this map has {flat.sizes.get(along, 1)}."
+            f"this figure needs at least two {words}, and this map has {data.sizes[along]}."
         )
-    alphas, nus = flat.sizes["restitution"], flat.sizes["packing_fraction"]
-    most_alphas = min(alphas, max(_MOST_ALPHAS, MOST_CURVES // nus))
-    counts = {
-        "restitution": (alphas, most_alphas),
-        "packing_fraction": (nus, MOST_CURVES // most_alphas),
+    counts = {name: data.sizes[name] for name in ("restitution", "packing_fraction")}
+    alphas = min(
+        counts["restitution"], max(_MOST_ALPHAS, MOST_CURVES // counts["packing_fraction"])
+    )
+    most = {"restitution": alphas, "packing_fraction": MOST_CURVES // alphas}
+    fewer = {name: most[name] for name, count in counts.items() if count > most[name]}
+    places = {
+        name: np.linspace(0, counts[name] - 1, k).round().astype(int) for name, k in fewer.items()
     }
-    more = {name: (count, most) for name, (count, most) in counts.items() if count > most}
-    chosen = {
-        name: np.linspace(0, count - 1, most).round().astype(int)
-        for name, (count, most) in more.items()
-    }
-    left = ", ".join(f"{m} of {n} {name.replace('_', ' ')}s" for name, (n, m) in more.items())
-    names = [name for name in _QUANTITIES if name in flat]
-    shown = selection(data, *names, along=along).isel(chosen)
-    return shown, f"Shown: {left}" if left else ""
+    shown = [f"{k} of {counts[name]} {name.replace('_', ' ')}s" for name, k in fewer.items()]
+    averages = data[[name for name in data if "/" not in str(name)]].isel(places)
+    flows = averages.stack(flow=("packing_fraction", "restitution"))
+    return flows.transpose("flow", along, ...), f"Shown: {', '.join(shown)}" if shown else ""
 
 
-def _flows(data: xr.Dataset) -> list[xr.Dataset]:
-    """Return the flows of a map, by packing fraction and restitution."""
-    nus, alphas = range(data.sizes["packing_fraction"]), range(data.sizes["restitution"])
-    return [data.isel(packing_fraction=k, restitution=j) for k in nus for j in alphas]
-
-
-def _add_legend(figure: Figure, data: xr.Dataset) -> None:
+def _add_legend(figure: Figure, flows: xr.Dataset) -> None:
     """Name the curves by α and ν."""
-    names = [
-        f"{flow.restitution.item():.4g}, {flow.packing_fraction.item():.4g}"
-        for flow in _flows(data)
-    ]
-    add_curve_legend(figure, names, r"$\alpha$, $\nu$", suspect(data).any())
+    names = [f"{alpha:.4g}, {nu:.4g}" for nu, alpha in flows.flow.values]
+    add_curve_legend(figure, names, r"$\alpha$, $\nu$", suspect(flows).any())
 
 
 def _draw_curves(
-    axes: Axes, data: xr.Dataset, along: str, name: str, relative: bool = False
+    axes: Axes, flows: xr.Dataset, along: str, name: str, relative: bool = False
 ) -> None:
     """Draw a quantity of all flows along a dimension, or its quotient with the last value."""
     draw_reference(axes)
     axes.set_xscale("log")
-    flows, x = _flows(data), data[along].values
-    for k, (flow, style) in enumerate(zip(flows, curve_styles(len(flows)), strict=True)):
-        value, error = flow[name].values, flow[f"{name}_stderr"].values
-        unit = abs(value[-1]) if relative else 1.0
-        apart = 1.03 ** (k - (len(flows) - 1) / 2) if relative else 1.0
-        draw_points(axes, x * apart, value / unit, suspect(flow), style, yerr=error / unit)
+    x, values, errors = flows[along].values, flows[name].values, flows[f"{name}_stderr"].values
+    unit = abs(values[:, -1:]) if relative else 1.0
+    order = np.arange(len(values))[:, None] - (len(values) - 1) / 2
+    apart = 1.03**order if relative else 1.0
+    draw_curves(axes, x * apart, values / unit, suspect(flows), yerr=errors / unit)
     margin = (x.max() / x.min()) ** 0.08
     axes.set_xlim(x.min() / margin, x.max() * margin)

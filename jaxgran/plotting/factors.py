@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from jaxgran.maps.schema import RATIO, MapData, what_lacks
 from jaxgran.model.display import counted
-from jaxgran.plotting.selection import describe, selection, suspect
+from jaxgran.plotting.selection import describe, plane, suspect
 from jaxgran.plotting.style import (
     NU_LABEL,
     RING,
@@ -44,22 +44,19 @@ PREFIX = "theory/enskog_factor_pressure_"
 CURVES = {"temperature": ("temperature", "#2a8c4a", "P")} | FACTORS
 """The same after the factor of the temperature, over the contact pressure of the whole theory."""
 
-_TEMPERATURE = f"{PREFIX}temperature"
 _PRODUCT = ("measured/theory", "black", "")
-_OF_TEMPERATURE = (
+_NEEDED = (
+    *(f"{PREFIX}{name}{end}" for name in FACTORS for end in ("", "_stderr")),
     *("granular_temperature", "stresses/kinetic_stress", "theory/granular_temperature"),
-    *("theory/pressure", "theory/enskog_pressure"),
+    *("theory/pressure", "theory/enskog_pressure", "theory/enskog_pressure_stderr"),
 )
-_NEEDED = [f"{PREFIX}{name}{end}" for name in FACTORS for end in ("", "_stderr")]
 _MOST_PANELS = 3
 _LABEL_HEIGHT = 0.07  # in heights of the panel
 
 
 def has_factors(data: xr.Dataset) -> bool:
     """Return whether a map has the variables and the range that :func:`enskog_factors` draws."""
-    return data.sizes["packing_fraction"] >= 2 and not what_lacks(
-        data, *RATIO, *_NEEDED, *_OF_TEMPERATURE
-    )
+    return data.sizes["packing_fraction"] >= 2 and not what_lacks(data, *RATIO, *_NEEDED)
 
 
 def with_temperature(data: xr.Dataset) -> xr.Dataset:
@@ -69,13 +66,8 @@ def with_temperature(data: xr.Dataset) -> xr.Dataset:
     kinetic = abs(sum(data["stresses/kinetic_stress"][..., a, a] for a in (0, 1))) / 2.0
     density = kinetic / data.granular_temperature  # grains over area
     contact = data["theory/pressure"] - density * data["theory/granular_temperature"]
-    enskog = "theory/enskog_pressure"
-    return data.assign(
-        {
-            _TEMPERATURE: data[enskog] / contact,
-            f"{_TEMPERATURE}_stderr": data[f"{enskog}_stderr"] / contact,
-        }
-    )
+    enskog = {end: data[f"theory/enskog_pressure{end}"] / contact for end in ("", "_stderr")}
+    return data.assign({f"{PREFIX}temperature{end}": value for end, value in enskog.items()})
 
 
 @styled
@@ -92,31 +84,24 @@ def enskog_factors(data: MapData) -> Figure:
       data: a map with `theory/enskog_factor_pressure_...` and `force_ratio`, with `_stderr`, the
         temperatures and pressures of flow and theory, and `status`. The largest of several numbers
         of grains and the shortest of several time steps are drawn.
-
-    Returns:
-      Error bars are one standard error; a point whose status is not `ok` is an open symbol in a
-      ring.
     """
-    data = with_temperature(
-        selection(data, *_OF_TEMPERATURE, *(f"{PREFIX}{name}" for name in FACTORS))
-    )
+    data = with_temperature(plane(data, *_NEEDED))
     count = data.sizes["restitution"]
     chosen = np.unique(np.round((count - 1) * np.linspace(0.9, 0.1, _MOST_PANELS)).astype(int))
+    shown = data.isel(restitution=chosen[::-1])
     figure = empty_figure(TWO_COLUMNS, height=3.0)
     grid = figure.subplots(1, len(chosen), sharex=True, sharey=True, squeeze=False)[0]
-    ends: dict[str, float] = {}
-    for axes, k in zip(grid, chosen[::-1], strict=True):
-        ends = _draw_factors(axes, data.isel(restitution=k))
-        axes.set(title=rf"$\alpha={data.restitution.values[k]:.4g}$", xlabel=NU_LABEL)
+    for k, axes in enumerate(grid):
+        _draw_factors(axes, shown.isel(restitution=k))
+        axes.set(title=rf"$\alpha={shown.restitution.values[k]:.4g}$", xlabel=NU_LABEL)
     grid[0].set(yscale="log", ylabel="factor of the contact pressure")
     grid[0].set_xlim(padded(data.packing_fraction.values))
     label_log_axis(grid[0].yaxis)
-    _label_ends(grid[-1], ends)
-    if suspect(data.isel(restitution=chosen)).any():
+    _label_ends(grid[-1], shown.isel(restitution=-1))
+    if suspect(shown).any():
         figure.legend(handles=[Line2D([], [], **RING)], loc="outside upper left")
-    shown = data.isel(restitution=chosen)
     logs = np.log([shown[f"{PREFIX}{name}"].where(shown[f"{PREFIX}{name}"] > 0) for name in CURVES])
-    whole, enskog, all_right = (
+    whole, enskog, every = (
         (abs(np.expm1(log)) <= 0.1).sum()
         for log in (logs.sum(axis=0), logs[1:].sum(axis=0), abs(logs[1:]).max(axis=0))
     )
@@ -125,8 +110,8 @@ def enskog_factors(data: MapData) -> Figure:
         data,
         f"At this $N$ the theory's contact pressure is right within 10 % at {whole} of "
         f"{counted(np.isfinite(logs).all(axis=0).sum(), 'measured point')}, Enskog's at the "
-        f"measured temperature at {enskog}, each of its assumptions at {all_right}"
-        f"{': errors cancel' if enskog > all_right else ''}",
+        f"measured temperature at {enskog}, each of its assumptions at {every}"
+        f"{': errors cancel' if enskog > every else ''}",
         f"Shown and counted: {len(chosen)} of {count} restitutions" if len(chosen) < count else "",
         "Each factor replaces one more assumption by what is measured; thick: their product; bars "
         "are standard errors",
@@ -134,34 +119,37 @@ def enskog_factors(data: MapData) -> Figure:
     return figure
 
 
-def _draw_factors(axes: Axes, data: xr.Dataset) -> dict[str, float]:
-    """Draw factors and product at one restitution; return the last value of each that is known."""
+def _draw_factors(axes: Axes, data: xr.Dataset) -> None:
+    """Draw factors and product at one restitution."""
     draw_reference(axes)
     nu, bad = data.packing_fraction.values, suspect(data)
-    values = {name: data[f"{PREFIX}{name}"].values for name in CURVES}
     for name, (_, colour, marker) in CURVES.items():
         style = {"color": colour, "marker": marker, "markersize": 3}
-        error = data[f"{PREFIX}{name}_stderr"].values
-        draw_points(axes, nu, values[name], bad, style, yerr=error)
-    values["product"] = np.prod(list(values.values()), axis=0)
-    axes.plot(nu, values["product"], color=_PRODUCT[1], linewidth=2.2, zorder=3)
-    known = {name: value[np.isfinite(value) & (value > 0)] for name, value in values.items()}
-    return {name: value[-1] for name, value in known.items() if value.size}
+        value, error = (data[f"{PREFIX}{name}{end}"].values for end in ("", "_stderr"))
+        draw_points(axes, nu, value, bad, style, yerr=error)
+    axes.plot(nu, _product(data), color=_PRODUCT[1], linewidth=2.2, zorder=3)
 
 
-def _label_ends(axes: Axes, ends: dict[str, float]) -> None:
+def _product(data: xr.Dataset) -> np.ndarray:
+    return np.prod([data[f"{PREFIX}{name}"].values for name in CURVES], axis=0)
+
+
+def _label_ends(axes: Axes, data: xr.Dataset) -> None:
     """Name the curves at their right ends, moved apart so that no name lies on another."""
+    values = {name: data[f"{PREFIX}{name}"].values for name in CURVES} | {"product": _product(data)}
+    known = {name: value[np.isfinite(value) & (value > 0)] for name, value in values.items()}
+    ends = {name: value[-1] for name, value in known.items() if value.size}
     names = sorted(ends, key=ends.__getitem__)
     to_axes = axes.transData + axes.transAxes.inverted()
     heights = np.array([to_axes.transform((0, ends[name]))[1] for name in names])
     steps = _LABEL_HEIGHT * np.arange(len(names))
     lowest = np.maximum.accumulate(heights - steps) + steps
     highest = np.minimum.accumulate((heights - steps)[::-1])[::-1] + steps
-    for name, height in zip(names, (lowest + highest) / 2, strict=True):
+    for name, end, height in zip(names, heights, (lowest + highest) / 2, strict=True):
         text, colour, _ = (CURVES | {"product": _PRODUCT})[name]
         axes.annotate(
             text,
-            (1.0, to_axes.transform((0, ends[name]))[1]),
+            (1.0, end),
             (1.06, height),
             xycoords="axes fraction",
             color=colour,

@@ -10,18 +10,17 @@ from typing import Any, NamedTuple, get_args
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxgran.maps.schema import RATIO, MapData, require_map
+from jaxgran.maps.schema import RATIO, MapData
 from jaxgran.model.checks import InputError, refused, require_flag, require_whole
 from jaxgran.model.choices import FileFormat
 from jaxgran.plotting.against import averages_against_grains, ratio_against_timestep
 from jaxgran.plotting.factors import enskog_factors, has_factors
 from jaxgran.plotting.ratio import ratio_contours, ratio_curves
-from jaxgran.plotting.selection import is_plane
+from jaxgran.plotting.selection import is_plane, points
 from jaxgran.plotting.style import FILE_DPI, write
 from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
 
-# bytes of a stem; file systems accept 255, and the names of figures are longer than their stem
-_LONGEST_NAME = 200
+_LONGEST_NAME = 200  # bytes of a stem; file systems accept 255, with the rest of the name
 
 
 class MapFigure(NamedTuple):
@@ -34,13 +33,18 @@ class MapFigure(NamedTuple):
 FIGURES = {
     "curves": MapFigure(ratio_curves, lambda data: True),
     "contours": MapFigure(ratio_contours, is_plane),
-    "timestep": MapFigure(ratio_against_timestep, lambda data: data.sizes.get("timestep", 1) >= 2),
-    "size": MapFigure(averages_against_grains, lambda data: data.sizes.get("grains", 1) >= 2),
-    "theory": MapFigure(theory_errors, lambda data: is_plane(data) and has_theory(data)),
+    "timestep": MapFigure(ratio_against_timestep, lambda data: data.sizes["timestep"] >= 2),
+    "size": MapFigure(averages_against_grains, lambda data: data.sizes["grains"] >= 2),
+    "theory": MapFigure(theory_errors, has_theory),
     "factors": MapFigure(enskog_factors, has_factors),
     "clusters": MapFigure(cluster_shares, has_clusters),
 }
 """All figures of a map by the ending of their files, in the order in which they are drawn."""
+
+
+def figure_path(stem: Path, name: str, format: str) -> Path:
+    """The file of an entry of ``FIGURES``."""
+    return stem.with_name(f"{stem.name}_{name}.{format}")
 
 
 def save_figures(
@@ -59,15 +63,13 @@ def save_figures(
     file                     function                    written if the map has
     =======================  ==========================  ===========================================
     `{stem}_curves.png`      `ratio_curves`              always
-    `{stem}_contours.png`    `ratio_contours`            at least two restitutions, two packing
-                                                         fractions, and one time step for all points
-    `{stem}_timestep.png`    `ratio_against_timestep`    at least two time steps
-    `{stem}_size.png`        `averages_against_grains`   at least two numbers of grains
-    `{stem}_theory.png`      `theory_errors`             a plane as for the contours, and the
-                                                         predictions of the theory
-    `{stem}_factors.png`     `enskog_factors`            two packing fractions, and the factors of
-                                                         the error of the theory
-    `{stem}_clusters.png`    `cluster_shares`            the shares of the clusters
+    `{stem}_contours.png`    `ratio_contours`            two restitutions and two packing fractions
+    `{stem}_timestep.png`    `ratio_against_timestep`    two time steps
+    `{stem}_size.png`        `averages_against_grains`   two numbers of grains
+    `{stem}_theory.png`      `theory_errors`             as for the contours, and predictions
+    `{stem}_factors.png`     `enskog_factors`            two packing fractions, and factors of the
+                                                         error of the theory
+    `{stem}_clusters.png`    `cluster_shares`            shares of clusters
     =======================  ==========================  ===========================================
 
     Args:
@@ -82,28 +84,26 @@ def save_figures(
       InputError: (a ValueError) the data are not a map, a choice is not one of these, or no files
         can be written there.
     """
-    data = require_map(data, *RATIO)
+    data = points(data, *RATIO)
     require_file(format, dpi)
     require_flag("overwrite", overwrite)
     stem = _writable(stem)
-    drawn = {
-        stem.with_name(f"{stem.name}_{name}.{format}"): figure.draw
+    possible = {
+        figure_path(stem, name, format): figure.draw
         for name, figure in FIGURES.items()
         if figure.is_possible(data)
     }
-    for path in drawn:
+    for path in possible:
         if path.is_dir():
             raise InputError(f"the figures must be files, and {str(path)!r} is a folder.")
-    written = [path for path in drawn if overwrite or not path.exists()]
-    for path in written:
-        write(drawn[path](data), path, dpi, caption)
-    return written
+    drawn = [path for path in possible if overwrite or not path.exists()]
+    for path in drawn:
+        write(possible[path](data), path, dpi, caption)
+    return drawn
 
 
 def _writable(stem: Path | str) -> Path:
-    """Return folder and beginning of the names of figures; InputError if nothing can be written
-    there.
-    """
+    """Return folder and beginning of the names of figures; InputError if it cannot be written."""
     if not isinstance(stem, (str, os.PathLike)):
         raise refused("stem", stem, "must be folder and beginning of the file names")
     stem = Path(stem)
@@ -116,11 +116,8 @@ def _writable(stem: Path | str) -> Path:
 
 def pictures_beside(path: Path) -> set[Path]:
     """The figures of a map that are beside its dataset, in whatever format."""
-    names = {
-        path.with_name(f"{path.stem}_{name}.{end}")
-        for name in FIGURES
-        for end in get_args(FileFormat)
-    }
+    stem = path.with_suffix("")
+    names = {figure_path(stem, name, end) for name in FIGURES for end in get_args(FileFormat)}
     return set(filter(Path.is_file, names))
 
 

@@ -6,7 +6,6 @@ largest speed and the largest force known, which set the scale of colours and wi
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.animation import FFMpegWriter
@@ -20,14 +19,13 @@ from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.files import atomic_write
 from jaxgran.io.paths import require_place
 from jaxgran.model.checks import InputError, short_repr
-from jaxgran.plotting.encoding import BINARY_COLOUR
 from jaxgran.plotting.flow import (
-    COLOURS,
+    BINARY_COLOUR,
+    SPEED_COLOURS,
     common_scale,
     draw_flow,
     force_key,
     network_of,
-    show_flow,
     title_of,
 )
 from jaxgran.plotting.style import empty_figure, styled
@@ -38,16 +36,8 @@ _MARGIN = 0.1  # inches, around a flow
 _HEAD, _FOOT = 0.4, 0.3  # inches, of the titles above and the legend below
 _DPI = 96  # pixels per inch
 _FRAMES_PER_SECOND = 12
-_SHADES = 8, 12, 4, 4  # colours of each ramp in the palette of a GIF; more make a larger file
+_SHADES = 10  # of each colour in a GIF; more make a larger file
 _Follow = Callable[[Sequence], Iterable]  # passes items on, and may report how many are done
-
-
-class Frame(NamedTuple):
-    """A flow at one time."""
-
-    network: ForceNetwork
-    title: str
-    strain: float  # since the first frame
 
 
 class Frames:
@@ -60,12 +50,8 @@ class Frames:
 
     def __init__(self, title: str | None = None):
         self.title = title
-        self._begin()
-
-    def _begin(self) -> None:
-        self.frames: list[Frame] = []
-        self._recorded = 0  # frames
-        self._stride = 1  # recorded frames per frame kept
+        self.frames: list[tuple[ForceNetwork, str]] = []  # flows and titles
+        self._recorded, self._stride = 0, 1  # frames recorded, in all and for each that is kept
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -75,14 +61,13 @@ class Frames:
         dropped.
         """
         if step == 0:
-            self._begin()
+            self.frames, self._recorded, self._stride = [], 0, 1
         if len(self.frames) == MOST_DRAWN:
             self.frames, self._stride = self.frames[::2], 2 * self._stride
         if self._recorded % self._stride == 0:
             per_step = (np.asarray(seen.timestep) * np.asarray(seen.shear_rate)).flat[0].item()
-            strain = step * per_step
-            title = title_of(seen, strain) if self.title is None else self.title
-            self.frames.append(Frame(network_of(seen), title, strain))
+            title = title_of(seen, step * per_step) if self.title is None else self.title
+            self.frames.append((network_of(seen), title))
         self._recorded += 1
 
 
@@ -114,54 +99,47 @@ def write_movie(path: Path, *flows: Frames, follow: _Follow = iter) -> None:
     figure = empty_figure(len(flows) * panel, panel + _HEAD + _FOOT)
     figure.set_layout_engine("none")  # a fixed layout, so that only the flow moves
     figure.set_dpi(_DPI)
+    drawings = _drawings(figure, flows, follow)
     with atomic_write(path) as temporary:
-        if path.suffix == ".gif":
-            palette = _palette()
-            first, *others = [
-                Image.fromarray(pixels[..., :3]).quantize(palette=palette, dither=Image.Dither.NONE)
-                for pixels in _drawings(figure, flows, follow)
-            ]
-            duration = 1000 // _FRAMES_PER_SECOND
-            first.save(temporary, save_all=True, append_images=others, duration=duration, loop=0)
-        else:
+        if path.suffix == ".mp4":
             writer = FFMpegWriter(_FRAMES_PER_SECOND)
             with writer.saving(figure, str(temporary), _DPI):
-                for _ in _drawings(figure, flows, follow):
+                for _ in drawings:
                     writer.grab_frame()
+            return
+        palette, no_dither = _palette(), Image.Dither.NONE
+        first, *others = (
+            Image.fromarray(pixels[..., :3]).quantize(palette=palette, dither=no_dither)
+            for pixels in drawings
+        )
+        duration = 1000 // _FRAMES_PER_SECOND
+        first.save(temporary, save_all=True, append_images=others, duration=duration, loop=0)
 
 
 def _drawings(figure: Figure, flows: Sequence[Frames], follow: _Follow) -> Iterator[np.ndarray]:
     """The pixels of each frame, (height, width, 4)."""
     canvas, (width, height) = FigureCanvasAgg(figure), figure.get_size_inches()
-    panel, panels = width / len(flows), []
-    for k, frames in enumerate(flows):
-        left = (k * panel + _MARGIN) / width
+    panel, scales, grid = width / len(flows), [], []
+    for k, flow in enumerate(flows):
+        left, low = (k * panel + _MARGIN) / width, (_FOOT + _MARGIN) / height
         size = (panel - 2 * _MARGIN) / width, (panel - 2 * _MARGIN) / height
-        axes = figure.add_axes((left, (_FOOT + _MARGIN) / height, *size))
-        scale = common_scale([frame.network for frame in frames.frames], "speed")
-        panels.append((axes, draw_flow(axes, frames.frames[0].network, "speed", scale), scale))
-    figure.legend(handles=force_key(panels[0][2])[:2], loc="lower center", ncols=2)
-    for moment in follow(list(zip(*(frames.frames for frames in flows), strict=True))):
-        for (axes, artists, scale), frame in zip(panels, moment, strict=True):
-            show_flow(artists, frame.network, "speed", scale)
-            axes.set_title(frame.title)
+        grid.append(figure.add_axes((left, low, *size)))
+        scales.append(common_scale(network for network, _ in flow.frames))
+    figure.legend(handles=force_key(scales[0])[:2], loc="lower center", ncols=2)
+    for moment in follow(list(zip(*(flow.frames for flow in flows), strict=True))):
+        for axes, (network, title), scale in zip(grid, moment, scales, strict=True):
+            draw_flow(axes, network, scale)
+            axes.set_title(title)
         canvas.draw()
-        yield np.asarray(canvas.buffer_rgba())
+        yield np.array(canvas.buffer_rgba())
 
 
 def _palette() -> Image.Image:
-    """The colours of grains, bars and text, fixed for all frames so that rare colours are kept."""
-    ramps = (
-        LinearSegmentedColormap.from_list("grey", ["white", "black"]),
-        COLOURS["speed"],
-        *(
-            LinearSegmentedColormap.from_list("bar", [BINARY_COLOUR, end])
-            for end in ("white", COLOURS["speed"](1.0))
-        ),
-    )
-    shades = np.concatenate(
-        [ramp(np.linspace(0, 1, n))[:, :3] for ramp, n in zip(ramps, _SHADES, strict=True)]
-    )
+    """The colours of grains, text and bars, fixed for all frames so that rare colours are kept."""
+    inks = [LinearSegmentedColormap.from_list(x, [x, "white"]) for x in ("black", BINARY_COLOUR)]
+    shades = [
+        ramp(np.linspace(0, 1, _SHADES), bytes=True)[:, :3] for ramp in (SPEED_COLOURS, *inks)
+    ]
     palette = Image.new("P", (1, 1))
-    palette.putpalette(np.round(255 * shades).astype(np.uint8).tobytes())
+    palette.putpalette(np.concatenate(shades).tobytes())
     return palette

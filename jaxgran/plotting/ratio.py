@@ -13,15 +13,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from jaxgran.maps.schema import MapData, flattened, shear_stress_ratio, what_lacks
-from jaxgran.plotting.encoding import EXCESS_LEVELS
+from jaxgran.maps.schema import MapData, shear_stress_ratio
 from jaxgran.plotting.plane import (
+    EXCESS_LEVELS,
     add_plane_legend,
     contour_variable,
     draw_plane,
-    label_axes,
 )
-from jaxgran.plotting.selection import describe, require_plane, selection, suspect
+from jaxgran.plotting.selection import describe, plane, require_plane, suspect
 from jaxgran.plotting.style import (
     ALPHA_TITLE,
     NU_LABEL,
@@ -29,8 +28,7 @@ from jaxgran.plotting.style import (
     RATIO_LABEL,
     TWO_COLUMNS,
     add_curve_legend,
-    curve_styles,
-    draw_points,
+    draw_curves,
     draw_reference,
     empty_figure,
     label_log_axis,
@@ -54,30 +52,27 @@ def ratio_curves(data: MapData) -> Figure:
 
     Returns:
       Two panels with one scale, or one where the map has no `stress_ratio`. Error bars are one
-      standard error; a point whose status is not `ok` is an open symbol in a ring.
+      standard error, and a point whose status is not `ok` is an open symbol in a ring, in all
+      figures of a map.
 
     Raises:
       InputError: (a ValueError) the data are not a map.
     """
-    tensor = ("stress_ratio", "stress_ratio_stderr")
-    has_tensor = not what_lacks(data, *tensor) and "axis_a" in flattened(data)["stress_ratio"].dims
-    data = selection(data, *(("stress_ratio",) if has_tensor else ()))
-    panels = [(RATIO_LABEL, data.force_ratio.values, data.force_ratio_stderr.values)]
-    if has_tensor:
-        panels += [(_SHEAR_LABEL, *(part.values for part in shear_stress_ratio(data)))]
+    data = plane(data)
+    panels = {RATIO_LABEL: (data.force_ratio, data.force_ratio_stderr)}
+    if "stress_ratio" in data and "stress_ratio_stderr" in data:
+        panels[_SHEAR_LABEL] = shear_stress_ratio(data)
     figure = empty_figure(TWO_COLUMNS, height=2.9)
     grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    bad = suspect(data)
-    for axes, letter, (label, ratio, error) in zip(grid, "ab", panels, strict=False):
+    nu, bad = data.packing_fraction.values, suspect(data)
+    for axes, letter, (label, (ratio, error)) in zip(grid, "ab", panels.items(), strict=False):
         draw_reference(axes)
-        for k, style in enumerate(curve_styles(len(data.restitution))):
-            x = data.packing_fraction.values
-            draw_points(axes, x, ratio[:, k], bad[:, k], style, yerr=error[:, k])
-        axes.set_xlim(padded(data.packing_fraction.values))
+        draw_curves(axes, nu, ratio.values.T, bad.T, yerr=error.values.T)
         axes.xaxis.set_major_locator(MaxNLocator(8, steps=(1, 2, 5, 10)))  # more would touch
-        axes.set(xlabel=NU_LABEL, ylabel=f"({letter}) {label}" if has_tensor else label)
+        ylabel = f"({letter}) {label}" if len(panels) > 1 else label
+        axes.set(xlim=padded(nu), xlabel=NU_LABEL, ylabel=ylabel)
         axes.tick_params(labelleft=True)
-    set_ratio_scale(grid[0], np.concatenate([ratio for _, ratio, _ in panels]))
+    set_ratio_scale(grid[0], np.concatenate([ratio.values for ratio, _ in panels.values()]))
     labels = [f"{alpha:.4g}" for alpha in data.restitution.values]
     add_curve_legend(figure, labels, ALPHA_TITLE, bad.any())
     describe(
@@ -87,9 +82,7 @@ def ratio_curves(data: MapData) -> Figure:
 
 
 def set_ratio_scale(axes: Axes, ratio: np.ndarray) -> None:
-    """Make the axis of a ratio logarithmic, with plain numbers, if the values have a large enough
-    range.
-    """
+    """Make the axis of a ratio logarithmic, with plain numbers, if the range is large enough."""
     values = ratio[np.isfinite(ratio) & (ratio > 0.0)]
     if values.size and values.max() >= LOG_SPAN * values.min():
         axes.set_yscale("log")
@@ -102,9 +95,8 @@ def ratio_contours(data: MapData) -> Figure:
 
     The contoured variable is asinh(excess/0.01). It is logarithmic for an excess well above 0.01,
     and linear below, where noise may make the excess negative. It is interpolated linearly between
-    the points. A cell with a missing corner is hatched. A level has two bands: of the points whose
-    excess differs from it by at most the interpolated standard error, and of those where it differs
-    by at most the error of interpolation, as estimated from points that are left out.
+    the points. A cell with a missing corner is hatched. The band of a level has the points whose
+    excess differs from it by at most the interpolated standard error.
 
     Args:
       data: as in :func:`ratio_curves`.
@@ -116,17 +108,16 @@ def ratio_contours(data: MapData) -> Figure:
     Raises:
       InputError: (a ValueError) fewer than two restitutions or two packing fractions.
     """
-    data = selection(data)
+    data = plane(data)
     require_plane(data)
     excess = data.force_ratio.values - 1.0
     error = np.nan_to_num(data.force_ratio_stderr.values)  # NaN where the ratio is 1 in all blocks
-    levels = {f"{level:.2f}": float(contour_variable(np.array(level))) for level in EXCESS_LEVELS}
+    levels = {f"{level:.2f}": float(contour_variable(level)) for level in EXCESS_LEVELS}
     figure = empty_figure(ONE_COLUMN, height=3.3)
     axes = figure.add_subplot()
-    greys = [str(value) for value in np.linspace(1.0, 0.8, len(levels) + 1)]
     fields = [contour_variable(excess + k * error) for k in (0.0, -1.0, 1.0)]
+    greys = [str(value) for value in np.linspace(1.0, 0.8, len(levels) + 1)]
     legend = draw_plane(axes, data, fields, levels, greys)
-    label_axes(np.array([[axes]]))
     add_plane_legend(figure, legend)
     reached = np.nanmin(excess, initial=np.inf), np.nanmax(excess, initial=-np.inf)
     absent = [f"{level:.2f}" for level in EXCESS_LEVELS if not reached[0] < level < reached[1]]

@@ -1,40 +1,46 @@
-"""What a figure shows of a map: its points in order, their status, and its parameters in words."""
+"""What a figure shows of a map: its points in four dimensions, their status, and its parameters."""
 
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxgran.maps.schema import FINEST, RATIO, MapData, finest, flag_names, require_map
+from jaxgran.maps.schema import RATIO, MapData, flag_names, flattened, require_map
 from jaxgran.model.checks import InputError
 from jaxgran.model.display import counted
 from jaxgran.plotting.style import add_caption, scientific
 
+DIMENSIONS = ("grains", "timestep", "packing_fraction", "restitution")
 
-def selection(data: MapData, *names: str, along: str | None = None) -> xr.Dataset:
-    """Return force ratio, status and the named variables, with their errors, as (packing_fraction,
-    restitution).
 
-    Of several numbers of grains the largest is kept, and of several time steps the shortest. The
-    dimension ``along`` is kept whole and comes first. The values of all axes increase.
+def expand_dims(data: MapData) -> xr.Dataset:
+    """Return a map, flattened, with all ``DIMENSIONS``.
+
+    A scalar coordinate becomes a dimension of one value. A dimension that the map does not tell has
+    the size one and no coordinate.
+    """
+    flat = flattened(data)
+    return flat.expand_dims([name for name in DIMENSIONS if name not in flat.dims])
+
+
+def points(data: MapData, *names: str) -> xr.Dataset:
+    """Return a map in the order of ``DIMENSIONS``, each of which increases.
 
     Raises:
       InputError: (a ValueError) the data are not a map, or the map lacks one of the variables.
     """
-    data = require_map(data, *RATIO, *names)
-    data = finest(data, *(name for name in FINEST if name != along))
-    shown = {*RATIO, *names, *(f"{name}_stderr" for name in names), "status"}
-    dims = [name for name in (along, "packing_fraction", "restitution") if name in data.dims]
-    return (
-        data[[name for name in data.data_vars if name in shown]]
-        .sortby(dims)
-        .transpose(*dims, ...)
-        .assign_attrs({"seeds": data.sizes.get("seed")} | data.attrs)
-    )
+    data = require_map(expand_dims(data) if isinstance(data, MapData) else data, *names)
+    return data.sortby(list(DIMENSIONS)).transpose(*DIMENSIONS, ...)
+
+
+def plane(data: MapData, *names: str) -> xr.Dataset:
+    """Return the points of the largest number of grains and the shortest time step, as
+    (packing_fraction, restitution).
+    """
+    return points(data, *RATIO, *names).isel(grains=-1, timestep=0)
 
 
 def is_plane(data: xr.Dataset) -> bool:
@@ -51,48 +57,45 @@ def require_plane(data: xr.Dataset) -> None:
         )
 
 
-def suspect(data: xr.Dataset) -> np.ndarray:
-    """Return whether a point has a value and a status that is not `ok`."""
-    return np.isfinite(data.force_ratio.values) & (_status_names(data) != "ok")
-
-
-def _status_names(data: xr.Dataset) -> np.ndarray:
-    """Return the name of the status of every point, in the shape of the map."""
+def status_names(data: xr.Dataset) -> np.ndarray:
+    """Return the name of the status of every point; `ok` in a map without a status."""
     if "status" not in data:
         return np.full(data.force_ratio.shape, "ok", dtype=object)
-    names, codes = flag_names(data.status), data.status.values
-    return np.array([names.get(code, f"status {code}") for code in codes.flat], object).reshape(
-        codes.shape
-    )
+    names = flag_names(data.status)
+    name_of = np.vectorize(lambda code: names.get(code, f"status {code}"), otypes=[object])
+    return name_of(data.status.values)
+
+
+def suspect(data: xr.Dataset) -> np.ndarray:
+    """Return whether a point has a value and a status that is not `ok`."""
+    return np.isfinite(data.force_ratio.values) & (status_names(data) != "ok")
 
 
 def describe(figure: Figure, data: xr.Dataset, *sentences: str) -> None:
     """Write the caption: sentences, the points that are missing or suspect, and the parameters."""
     measured = np.isfinite(data.force_ratio.values)
-    counts = Counter(name for name in _status_names(data).flat if name != "ok")
+    counts = Counter(name for name in status_names(data).flat if name != "ok")
     bad = ", ".join(f"{name.replace('_', ' ')} ({count})" for name, count in counts.most_common())
-    lost = (~measured).sum()
-    missing = f"{lost} of {counted(measured.size, 'point')} without a value"
+    missing = f"{(~measured).sum()} of {counted(measured.size, 'point')} without a value"
     notes = [f"Status not ok: {bad}"] * bool(bad) + [missing] * (not measured.all())
-    add_caption(figure, [*sentences, *notes, _parameters(data.attrs)])
+    add_caption(figure, [*sentences, *notes, _parameters(data)])
     if not measured.any():
         for axes in figure.axes:
             axes.text(0.5, 0.6, "no measured values", transform=axes.transAxes, ha="center")
 
 
-def _parameters(attrs: dict[str, Any]) -> str:
+def _parameters(data: xr.Dataset) -> str:
     """Return the parameters on which a force ratio depends; one of several values has an axis."""
-    parts = []
-    if "grains_by_point" in attrs:
-        parts.append(
-            f"$N={np.min(attrs['grains_by_point'])}$ to ${np.max(attrs['grains_by_point'])}$"
-        )
-    elif np.ndim(attrs.get("grains", ())) == 0:
-        parts.append(f"$N={attrs['grains']}$")
-    if attrs.get("seeds") is not None:
+    attrs, parts = data.attrs, []
+    if "point_grains" in data:
+        sizes = data.point_grains.values
+        parts.append(f"$N={sizes.min()}$ to ${sizes.max()}$")
+    elif "grains" in data.coords and data.grains.ndim == 0:
+        parts.append(f"$N={data.grains.item()}$")
+    if "seeds" in attrs:
         parts.append(counted(attrs["seeds"], "seed"))
-    if np.ndim(attrs.get("timestep", ())) == 0:
-        parts.append(rf"$\mathrm{{d}}t={scientific(float(attrs['timestep']))}/\dot{{\gamma}}$")
+    if "timestep" in data.coords and data.timestep.ndim == 0:
+        parts.append(rf"$\mathrm{{d}}t={scientific(data.timestep.item())}/\dot{{\gamma}}$")
     if "activation" in attrs:
         parts.append(f"{attrs['activation']} activation")
     if "strain" in attrs:

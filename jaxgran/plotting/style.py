@@ -6,9 +6,10 @@ No plotting state remains changed, and no display is needed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
 from io import BytesIO
+from itertools import cycle
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -20,7 +21,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import (
-    Locator,
     LogFormatterSciNotation,
     LogLocator,
     MaxNLocator,
@@ -81,10 +81,7 @@ RING: dict[str, Any] = {
 P = ParamSpec("P")
 R = TypeVar("R")
 _CAPTION = "caption"  # id of the text under the axes
-_MANY_DECADES = 200  # largest over smallest value from which only powers of ten have numbers
-_NARROW = 4  # largest over smallest value up to which numbers have equal steps
-_LEAST_PLAIN = 1e-3  # smallest number that is written without a power of ten
-ROUND_STEPS = (1, 2, 5, 10)  # their multiples include 1
+_ROUND_STEPS = (1, 2, 5, 10)  # their multiples include 1
 _SAVED: dict[str, dict[str, Any]] = {
     "png": {"pil_kwargs": {"compress_level": 3}},  # 3 % larger than the default, 25 % faster
     "pdf": {"metadata": {"CreationDate": None}},
@@ -157,26 +154,19 @@ def write(figure: Figure, path: Path, dpi: int = FILE_DPI, caption: bool = True)
 
 
 def curve_styles(count: int) -> list[dict[str, Any]]:
-    """Return a colour, marker and line style for each curve; the colours also differ in a grey
-    print.
-    """
+    """Return a colour, marker and line style for each curve; they differ also in a grey print."""
     ramp = colormaps["viridis"](np.linspace(0.0, 0.82, count))
+    looks = zip(ramp, cycle(_MARKERS), cycle(_LINE_STYLES), strict=False)
     return [
-        {
-            "color": tuple(ramp[k]),
-            "marker": _MARKERS[k % len(_MARKERS)],
-            "linestyle": _LINE_STYLES[k % len(_LINE_STYLES)],
-        }
-        for k in range(count)
+        {"color": tuple(colour), "marker": marker, "linestyle": line}
+        for colour, marker, line in looks
     ]
 
 
 def draw_points(
     axes: Axes, x: np.ndarray, y: np.ndarray, bad: np.ndarray, style: dict[str, Any], **errors: Any
 ) -> None:
-    """Draw a curve with its error bars; a point whose status is not `ok` is an open symbol in a
-    ring.
-    """
+    """Draw a curve with its error bars; a point whose status is not `ok` is open, in a ring."""
     axes.errorbar(x, y, **style, **errors, elinewidth=0.8)
     if bad.any():
         opened = style | {"linestyle": "none", "markerfacecolor": "white", "zorder": 4}
@@ -184,19 +174,24 @@ def draw_points(
         axes.plot(x[bad], y[bad], **RING, zorder=5)
 
 
-def add_curve_legend(
-    figure: Figure, labels: Iterable[str], title: str, bad: Any, **place: Any
+def draw_curves(
+    axes: Axes, x: np.ndarray, y: np.ndarray, bad: np.ndarray, **errors: np.ndarray
 ) -> None:
-    """Name the curves, in the order of ``curve_styles``, and the ring if there is any, beside the
-    axes.
-    """
-    names = list(labels)
-    styles = zip(names, curve_styles(len(names)), strict=True)
+    """Draw curves (curves, points) with their error bars in the order of ``curve_styles``."""
+    x = np.broadcast_to(x, y.shape)
+    for k, style in enumerate(curve_styles(len(y))):
+        bars = {name: error[k] for name, error in errors.items()}
+        draw_points(axes, x[k], y[k], bad[k], style, **bars)
+
+
+def add_curve_legend(figure: Figure, labels: Sequence[str], title: str, bad: Any) -> None:
+    """Name the curves, in the order of ``curve_styles``, and the ring if there is any."""
+    styles = zip(labels, curve_styles(len(labels)), strict=True)
     handles = [Line2D([], [], **style, label=label) for label, style in styles]
-    if bad:
-        handles.append(Line2D([], [], **RING))
-    place = {"loc": "outside right upper", "ncols": 1 + (len(handles) - 1) // 16} | place
-    figure.legend(handles=handles, title=title, handlelength=3.2, **place)
+    handles += [Line2D([], [], **RING)] * bool(bad)
+    columns = 1 + (len(handles) - 1) // 16
+    place = {"loc": "outside right upper", "ncols": columns, "handlelength": 3.2}
+    figure.legend(handles=handles, title=title, **place)
 
 
 # ----------------------------------------------------------------------------------------------
@@ -204,34 +199,21 @@ def add_curve_legend(
 
 
 def label_log_axis(axis: Axis) -> None:
-    """Put the numbers of ``log_locator`` at a logarithmic axis."""
+    """Number a logarithmic axis: equal steps, or 1, 2 and 5 of a decade, or powers of ten."""
     low, high = axis.get_view_interval()
+    if high <= 4 * low:
+        axis.set_major_locator(MaxNLocator(4, steps=_ROUND_STEPS))
+    else:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 200 * low else (1,), numticks=9))
     every = LogFormatterSciNotation(minor_thresholds=(np.inf, np.inf))
-    axis.set_major_locator(log_locator(low, high, 9 if high < _MANY_DECADES * low else 0))
-    axis.set_major_formatter(every if low < _LEAST_PLAIN else StrMethodFormatter("{x:g}"))
+    axis.set_major_formatter(every if low < 1e-3 else StrMethodFormatter("{x:g}"))
     axis.set_minor_formatter(NullFormatter())
-
-
-def log_locator(low: float, high: float, most: int) -> Locator:
-    """Return the ticks of a logarithmic axis: 1, 2 and 5 of each decade, powers of ten, or equal
-    steps.
-
-    Powers of ten are those where 1, 2 and 5 are more than `most` numbers; equal steps are those of
-    a small part of a decade.
-    """
-    if high <= _NARROW * low:
-        return MaxNLocator(4, steps=ROUND_STEPS)
-    numbers = np.outer(
-        10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high))), (1, 2, 5)
-    )
-    fit = ((low <= numbers) & (numbers <= high)).sum() <= most
-    return LogLocator(subs=(1, 2, 5) if fit else (1,), numticks=9)
 
 
 def draw_reference(axes: Axes) -> None:
     """Draw the line of value 1; it has a number at the axis."""
     axes.axhline(1.0, color="0.6", linewidth=0.8, zorder=0)
-    axes.yaxis.set_major_locator(MaxNLocator(7, steps=ROUND_STEPS))
+    axes.yaxis.set_major_locator(MaxNLocator(7, steps=_ROUND_STEPS))
 
 
 def scientific(value: float) -> str:

@@ -9,11 +9,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from jaxgran.maps.schema import RATIO, MapData, what_lacks
 from jaxgran.model.choices import HALF_INTERVAL
@@ -24,58 +20,40 @@ from jaxgran.plotting.plane import (
     add_plane_legend,
     draw_binary_limit,
     draw_plane,
-    label_axes,
 )
-from jaxgran.plotting.selection import describe, is_plane, require_plane, selection, suspect
+from jaxgran.plotting.selection import describe, is_plane, plane, require_plane, suspect
 from jaxgran.plotting.style import (
     ALPHA_TITLE,
-    ONE_COLUMN,
-    RING,
     TWO_COLUMNS,
-    draw_points,
+    add_curve_legend,
+    draw_curves,
     empty_figure,
     label_log_axis,
     styled,
 )
 
-ERROR_LEVELS = {
-    "÷10": np.log(0.1),
-    "÷5": np.log(0.2),
-    "−50 %": np.log(0.5),
-    "−25 %": np.log(0.75),
-    "−10 %": np.log(0.9),
-    "−5 %": np.log(0.95),
-    "+5 %": np.log(1.05),
-    "+10 %": np.log(1.1),
-    "+25 %": np.log(1.25),
-    "+50 %": np.log(1.5),
-    "×2": np.log(2.0),
-    "×5": np.log(5.0),
-    "×10": np.log(10.0),
-}
+_LABELS = "÷10", "÷5", "−50 %", "−25 %", "−10 %", "−5 %", "+5 %", "+10 %", "+25 %", "+50 %"
+_QUOTIENTS = 0.1, 0.2, 0.5, 0.75, 0.9, 0.95, 1.05, 1.1, 1.25, 1.5, 2.0, 5.0, 10.0
+ERROR_LEVELS: dict[str, float] = dict(
+    zip((*_LABELS, "×2", "×5", "×10"), np.log(_QUOTIENTS), strict=True)
+)
 """Contour values of the logarithm of a quotient, by their labels."""
 
-SHARE_LEVELS = {f"{level:.2f}": level for level in (0.05, 0.10, 0.25, 0.50, 0.75, 0.90)}
-"""Contour values of the share of clusters, by their labels."""
-
 _QUANTITIES = {"pressure": "pressure", "shear_stress": "shear stress"}
-_MEASURED = (*_QUANTITIES, "stress_ratio")
-_LARGE = tuple(f"{name}_large_system{end}" for name in _QUANTITIES for end in ("", "_ci95"))
 _THEORY = (
-    *_LARGE,
+    *(*_QUANTITIES, "stress_ratio"),
+    *(f"{name}_large_system{end}" for name in _QUANTITIES for end in ("", "_ci95")),
     *(f"theory/{name}" for name in _QUANTITIES),
-    *("stresses/kinetic_stress", "stresses/binary_stress"),
-    *(f"{name}_stderr" for name in _MEASURED),
+    *("stresses/kinetic_stress", "stresses/binary_stress", "stress_ratio_stderr"),
 )
 _SHARE = "stresses/cluster_pressure_share"
 CLUSTERS = (_SHARE, f"{_SHARE}_stderr")
 _LEAST_EXCESS = 1e-5  # smallest excess that its logarithmic axis shows
-_EXCESS_LABEL = r"excess $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle-1$"
 
 
 def has_theory(data: xr.Dataset) -> bool:
-    """Return whether a map has the variables that :func:`theory_errors` draws."""
-    return not what_lacks(data, *RATIO, *_MEASURED, *_THEORY)
+    """Return whether a map has the variables and the plane that :func:`theory_errors` draws."""
+    return is_plane(data) and not what_lacks(data, *RATIO, *_THEORY)
 
 
 def has_clusters(data: xr.Dataset) -> bool:
@@ -101,26 +79,22 @@ def error_parts(data: xr.Dataset, quantity: str) -> dict[str, tuple[np.ndarray, 
     Binary is the measured kinetic stress plus the contact stress if all collisions were binary. All
     are NaN where a quotient is not positive or not known.
     """
-    components = [(0, 0), (1, 1)] if quantity == "pressure" else [(0, 1)]
+    sign, components = (1, [(0, 0), (1, 1)]) if quantity == "pressure" else (-1, [(0, 1)])
 
     def part_of(tensor: xr.DataArray) -> np.ndarray:
         return np.mean([tensor.isel(axis_a=a, axis_b=b).values for a, b in components], axis=0)
 
-    large = f"{quantity}_large_system"
-    measured, theory, limit = (
-        data[name].values for name in (quantity, f"theory/{quantity}", large)
-    )
-    stderr = data[f"{large}_ci95"].sel(error_source="total").values / HALF_INTERVAL
-    sign = 1 if quantity == "pressure" else -1
+    large, theory = data[f"{quantity}_large_system"].values, data[f"theory/{quantity}"].values
+    ci95 = data[f"{quantity}_large_system_ci95"].sel(error_source="total").values
     kinetic, collisional = (
         sign * part_of(data[f"stresses/{name}_stress"]) for name in ("kinetic", "binary")
     )
-    ratio_error = part_of(np.abs(data.stress_ratio_stderr / data.stress_ratio))
     binary = kinetic + collisional
+    ratio_error = part_of(np.abs(data.stress_ratio_stderr / data.stress_ratio))
     with np.errstate(divide="ignore", invalid="ignore"):
         parts = {
-            "total": (np.log(theory / limit), stderr / limit),
-            "binary": (np.log(binary / measured), collisional / binary * ratio_error),
+            "total": (np.log(theory / large), ci95 / HALF_INTERVAL / large),
+            "binary": (np.log(binary / data[quantity].values), collisional / binary * ratio_error),
         }
     return {
         name: (np.where(np.isfinite(value), value, np.nan), error)
@@ -144,21 +118,21 @@ def theory_errors(data: MapData) -> Figure:
     Raises:
       InputError: (a ValueError) fewer than two restitutions or two packing fractions.
     """
-    data = selection(data, *_MEASURED, *_THEORY)
+    data = plane(data, *_THEORY)
     require_plane(data)
     figure = empty_figure(TWO_COLUMNS, height=5.4)
     grid = figure.subplots(2, 2, sharex=True, sharey=True)
-    tints = colormaps["PuOr_r"](np.linspace(0.12, 0.88, len(ERROR_LEVELS) + 1))
+    tints = 0.55 + 0.45 * colormaps["PuOr_r"](np.linspace(0.12, 0.88, len(ERROR_LEVELS) + 1))
+    titles = {"total": "all assumptions", "binary": "binary collisions alone"}
     legend: Legend = {}
-    titles = ("all assumptions", "binary collisions alone")
-    panels = zip(grid.flat, "abcd", [(q, k) for q in _QUANTITIES for k in (0, 1)], strict=True)
-    for axes, letter, (quantity, column) in panels:
-        value, error = list(error_parts(data, quantity).values())[column]
+    panels = [(quantity, part) for quantity in _QUANTITIES for part in titles]
+    for axes, letter, (quantity, part) in zip(grid.flat, "abcd", panels, strict=True):
+        value, error = error_parts(data, quantity)[part]
         fields = value, value - error, value + error
-        legend |= draw_plane(axes, data, fields, ERROR_LEVELS, 0.55 + 0.45 * tints)
+        legend |= draw_plane(axes, data, fields, ERROR_LEVELS, tints)
         legend |= draw_binary_limit(axes, data)
-        axes.set_title(f"({letter}) {_QUANTITIES[quantity]}: {titles[column]}")
-    label_axes(grid)
+        axes.set_title(f"({letter}) {_QUANTITIES[quantity]}: {titles[part]}")
+        axes.label_outer()
     add_plane_legend(figure, legend)
     total = error_parts(data, "pressure")["total"][0]
     wrong = abs(np.expm1(total)) > 0.1
@@ -182,76 +156,34 @@ def theory_errors(data: MapData) -> Figure:
 
 @styled
 def cluster_shares(data: MapData) -> Figure:
-    """Return the share of the contact pressure that clusters of three or more grains carry.
-
-    Left: against the excess of the force ratio, coloured by restitution. Right, if the map is a
-    plane: its contours.
+    """Return the share of the contact pressure that clusters of three or more grains carry, against
+    the excess of the force ratio, one curve per restitution.
 
     Args:
       data: a map with `stresses/cluster_pressure_share` and `force_ratio`, with `_stderr`, and
         `status`.
-
-    Returns:
-      Error bars are one standard error, in both directions.
     """
-    data = selection(data, _SHARE)
-    plane = is_plane(data)
-    figure = empty_figure(TWO_COLUMNS if plane else ONE_COLUMN, height=2.9)
-    grid = figure.subplots(1, 1 + plane, squeeze=False)
-    beyond = _draw_shares(grid[0, 0], data)
-    legend: Legend = {}
-    if suspect(data).any():
-        legend[RING["label"]] = Line2D([], [], **RING)
-    if plane:
-        axes, share, error = grid[0, 1], data[_SHARE].values, data[f"{_SHARE}_stderr"].values
-        greys = [str(value) for value in np.linspace(1.0, 0.8, len(SHARE_LEVELS) + 1)]
-        fields = share, share - error, share + error
-        legend |= draw_plane(axes, data, fields, SHARE_LEVELS, greys)
-        legend |= draw_binary_limit(axes, data)
-        label_axes(grid[:, 1:])
-        grid[0, 0].set_title("(a) against the excess")
-        axes.set_title("(b) in the plane")
-    add_plane_legend(figure, legend)
+    data = plane(data, *CLUSTERS)
+    excess, share, bad = data.force_ratio.values - 1.0, data[_SHARE].values, suspect(data)
+    x_error, y_error = data.force_ratio_stderr.values, data[f"{_SHARE}_stderr"].values
+    figure = empty_figure(TWO_COLUMNS, height=2.9)
+    axes = figure.add_subplot(ylim=(-0.03, 1.03), ylabel="share of pressure in clusters")
+    draw_curves(axes, excess.T, share.T, bad.T, xerr=x_error.T, yerr=y_error.T)
+    shown = excess >= _LEAST_EXCESS
+    limits = (excess[shown].min() / 1.6, excess[shown].max() * 1.6) if shown.any() else (1e-5, 1)
+    label = r"excess of the force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle-1$"
+    axes.set(xscale="log", xlim=limits, xlabel=label)
+    label_log_axis(axes.xaxis)
+    labels = [f"{alpha:.4g}" for alpha in data.restitution.values]
+    add_curve_legend(figure, labels, ALPHA_TITLE, bad.any())
+    beyond = (np.isfinite(excess) & ~shown).sum()
     describe(
         figure,
         data,
-        "Share of the contact pressure in clusters of three or more grains"
-        + (": it grows with the excess of the force ratio" if _grows(data) else ""),
-        f"{counted(beyond, 'point')} left out, whose excess is too small for the axis; bars are "
-        "standard errors"
+        "Share of the contact pressure in clusters of three or more grains; bars are standard "
+        "errors",
+        f"{counted(beyond, 'point')} left out, whose excess is too small for the axis"
         if beyond
-        else "Bars are standard errors",
+        else "",
     )
     return figure
-
-
-def _grows(data: xr.Dataset) -> bool:
-    """Return whether the share grows with the excess: by ranks, over at least three points."""
-    excess, share = data.force_ratio.values, data[_SHARE].values
-    known = np.isfinite(excess) & np.isfinite(share)
-    if known.sum() < 3:
-        return False
-    of_excess, of_share = (np.argsort(np.argsort(x[known])) for x in (excess, share))
-    return bool(np.corrcoef(of_excess, of_share)[0, 1] > 0.5)
-
-
-def _draw_shares(axes: Axes, data: xr.Dataset) -> int:
-    """Draw shares against the excess, in the colour of their restitution; return how many points
-    are not on the logarithmic axis.
-    """
-    excess, share, bad = data.force_ratio.values - 1.0, data[_SHARE].values, suspect(data)
-    x_error, y_error = data.force_ratio_stderr.values, data[f"{_SHARE}_stderr"].values
-    colours = ScalarMappable(Normalize(0.0, 1.2), "viridis")  # up to 1: no yellow
-    for k, alpha in enumerate(data.restitution.values):
-        style = {"color": colours.to_rgba(alpha), "marker": "o", "markersize": 3, "linestyle": ""}
-        errors = {"xerr": x_error[:, k], "yerr": y_error[:, k]}
-        draw_points(axes, excess[:, k], share[:, k], bad[:, k], style, **errors)
-    shown = excess >= _LEAST_EXCESS
-    limits = (excess[shown].min() / 1.6, excess[shown].max() * 1.6) if shown.any() else (1e-5, 1)
-    axes.set(xscale="log", xlim=limits, ylim=(-0.03, 1.03), xlabel=_EXCESS_LABEL)
-    label_log_axis(axes.xaxis)
-    axes.set_ylabel("share of pressure in clusters")
-    bar = axes.figure.colorbar(colours, cax=axes.inset_axes((0.08, 0.5, 0.035, 0.4)))
-    bar.set_label(ALPHA_TITLE)
-    bar.ax.set_ylim(0.0, 1.0)
-    return int((np.isfinite(excess) & ~shown).sum())
