@@ -7,8 +7,7 @@ it says how the map is run and kept. From the rows follow
   documentation,
 - the checks of ranges in ``check_settings``,
 - the attributes of the dataset, which ``--resume``, ``--from-map`` and ``merge`` compare, see
-  ``attributes``, and
-- the command on a page of a map that measures a point again.
+  ``attributes``.
 
 ``ratio_map`` takes them as arguments with the same defaults. This module loads neither JAX nor
 xarray by itself, so that the command line prints its help at once.
