@@ -44,9 +44,11 @@ from jaxgran.model.checks import InputError, concrete_or_none, require_number, s
 from jaxgran.model.choices import SolverName
 from jaxgran.model.values import register_fields
 
+IMPULSES, RESPONSE = range(2)  # rows of a point: J and W J
+
 
 class Iterate(NamedTuple):
-    """State of the iteration; a point holds impulses and their response W J."""
+    """State of the iteration."""
 
     point: Float[Array, "2 contacts"]
     previous: Float[Array, "2 contacts"]
@@ -203,7 +205,7 @@ class BarzilaiBorwein(ProjectedMethod):
         along_step = is_long | guarded
         # One product for all cases: sᵀDs of a long step, (Ws)ᵀD⁻¹Ws of a short one, and the descent
         # of a guarded one, which is positive where the step turns uphill
-        scaled_step = bound * jnp.where(guarded, start[0] - point[0], step)
+        scaled_step = bound * jnp.where(guarded, start[IMPULSES] - point[IMPULSES], step)
         scaled = jnp.where(along_step, scaled_step, response / bound)
         square = dot(scaled, jnp.where(along_step, step, response))
         curvature = dot(step, response)  # sᵀWs
@@ -243,7 +245,8 @@ class Nesterov(ProjectedMethod):
     def learn(
         self, now: Iterate, start: Array, point: Array, bound: Array, best_residual: Array
     ) -> Any:
-        uphill = dot(bound * (start[0] - point[0]), point[0] - now.point[0]) > 0
+        step = point[IMPULSES] - now.point[IMPULSES]
+        uphill = dot(bound * (start[IMPULSES] - point[IMPULSES]), step) > 0
         return jnp.where(uphill, 0, now.memory + 1)
 
 

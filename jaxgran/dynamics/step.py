@@ -4,10 +4,21 @@ Its functions take what does not change (``Constants``) and what does (``Carry``
 ``Carry``:
 
 - ``refresh_lists``: new lists of near pairs.
-- ``fly``: free flight over a number of steps.
-- ``collide``: the contacts of one step change the velocities.
 - ``event``: a flight up to the step in which some pair next becomes an approaching contact, and
   the contacts of that step.
+- ``fly``: free flight over a number of steps.
+- ``collide``: the contacts of one step change the velocities: the near list becomes a buffer of
+  ``ContactPairs``, these a network of ``Contacts``, and their solution a ``Collision``.
+
+How long a near list is valid. It holds every pair whose gap was at most its skin s when it was
+built. With V a bound on how fast a gap closes (``closing_speed_bound``), which changes with every
+collision, any other pair still has a gap of more than
+
+    slack = s − Σ V t,    over the flights of duration t since the list was built.
+
+A step looks θ·dt ahead, so the list holds all of its contacts while slack ≥ V θ dt; below that it
+has expired. So a flight has at most slack/(V dt) − θ steps, and a list that does not allow for one
+step, slack < V (1 + θ) dt, is renewed before the event.
 
 In a batch, a replica that is finished or has no step to solve keeps what it has, see
 ``model.control_flow``.
@@ -23,7 +34,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.contact.compaction import count_bits, pack_bits
 from jaxgran.contact.delassus import NetworkOperator
-from jaxgran.contact.law import first_step, flight_of, kinetic_means
+from jaxgran.contact.law import contact_terms, first_step, flight_of, kinetic_means
 from jaxgran.contact.near_pairs import (
     Frame,
     PairLists,
@@ -33,15 +44,15 @@ from jaxgran.contact.near_pairs import (
     separations_now,
 )
 from jaxgran.contact.network import (
+    ContactPairs,
     PairMotion,
-    Touching,
     first_contact_time,
     is_contact,
     pair_motion,
 )
 from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.contact.solver import single_contact, solve
-from jaxgran.dynamics.contact_sums import impulses_of, sums_of_contacts
+from jaxgran.dynamics.contact_sums import solved_contacts
 from jaxgran.dynamics.moving_contacts import contact_delays, delayed_shift, displaced, is_binary
 from jaxgran.dynamics.observer import (
     Observe,
@@ -52,13 +63,13 @@ from jaxgran.dynamics.observer import (
     with_contacts,
     with_flight,
 )
-from jaxgran.dynamics.tally import CONTACT, FLIGHT, LARGEST, SOLVE, RunningSums, empty_sums
+from jaxgran.dynamics.tally import CONTACT, RunningSums, empty_sums
 from jaxgran.dynamics.velocity_scales import READ_AFTER, readings
 from jaxgran.model.control_flow import any_replica, switch_replica, where_active
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.indexing import taken
-from jaxgran.model.reductions import largest, smallest
+from jaxgran.model.reductions import largest, smallest, sums_of
 from jaxgran.model.state import State, status_at_start
 from jaxgran.model.status import Status
 
@@ -87,7 +98,7 @@ class Carry(NamedTuple):
 
     lists: PairLists
     pairs: PairMotion  # of the near list
-    slack: Float[Array, ""]  # unused skin of the near list; the look-ahead of a step takes a part
+    slack: Float[Array, ""]  # of the near list, see the module
     closing_speed: Float[Array, ""]  # bound on how fast any gap closes
     velocities: Float[Array, "grains 2"]
     step: Int[Array, ""]  # steps flown
@@ -124,7 +135,7 @@ def unfinished(constants: Constants, now: Carry) -> Bool[Array, ""]:
 
 
 def needs_lists(constants: Constants, now: Carry) -> Bool[Array, ""]:
-    """Whether the near list may miss a contact of the next step, which looks θ·dt beyond itself."""
+    """Whether the near list may miss a contact of the next step."""
     flow = constants.flow
     suffices = now.slack >= now.closing_speed * (1 + flow.activation) * flow.timestep
     return unfinished(constants, now) & ~suffices
@@ -174,9 +185,9 @@ def event(constants: Constants, now: Carry) -> Carry:
     jump = _steps_to_fly(constants, now)
     after_flight = fly(constants, now, jump)
 
-    spare = after_flight.slack - now.closing_speed * flow.activation * flow.timestep
-    rounding = 16 * jnp.finfo(spare.dtype).eps * near.skin  # of the slack, summed over flights
-    expired = spare < -rounding
+    slack = after_flight.slack - now.closing_speed * flow.activation * flow.timestep
+    rounding = 16 * jnp.finfo(slack.dtype).eps * near.skin  # summed over flights
+    expired = slack < -rounding
     needs_solve = active & (after_flight.step < constants.steps) & ~(expired & (jump > 0))
     collided = collide(constants, after_flight, needs_solve)
 
@@ -199,11 +210,11 @@ def _steps_to_fly(constants: Constants, now: Carry) -> Int[Array, ""]:
     to_contact = smallest(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
     longest = jnp.divide(LONGEST_FLIGHT, flow.shear_rate) / flow.timestep
     of_list = now.slack / now.closing_speed / flow.timestep - flow.activation
-    jump = jnp.minimum(to_contact, jnp.floor(jnp.minimum(of_list, longest)))
-    wanted = jnp.where(constants.free_flight, jump, 0)
+    possible = jnp.minimum(to_contact, jnp.floor(jnp.minimum(of_list, longest)))
+    jump = jnp.where(constants.free_flight, possible, 0)
     remaining = constants.steps - now.step
     return jnp.clip(
-        jnp.minimum(wanted, remaining.astype(wanted.dtype)).astype(jnp.int32), least, remaining
+        jnp.minimum(jump, remaining.astype(jump.dtype)).astype(jnp.int32), least, remaining
     )
 
 
@@ -254,8 +265,7 @@ def _with_flight(
     products = ((px, cx), (px, cy), (py, cy))
     xx, xy, yy = (jnp.dot(p, c, precision=lax.Precision.HIGHEST) for p, c in products)
     means = kinetic_means(xx, xy, yy, shear_rate * time)
-    flight = jnp.stack([time, steps.astype(time.dtype), *(time * mean for mean in means)])
-    return sums.with_sums(flight=sums.of(FLIGHT) + flight)
+    return sums.added(duration=time, steps=steps, kinetic_moment=[time * mean for mean in means])
 
 
 class Collision(NamedTuple):
@@ -286,11 +296,11 @@ def collide(constants: Constants, now: Carry, needs_solve: Bool[Array, ""]) -> C
     if constants.moving_contacts:
         delays = contact_delays(now.pairs, near.reach, approaching, flow.timestep)
         motion = now.pairs.moved(jnp.where(is_binary(near, contact, grains), delays, 0))
-    touching, words = Touching(near.i, near.j, near.reach, motion, contact), pack_bits(contact)
+    pairs, words = ContactPairs(near.i, near.j, near.reach, motion, contact), pack_bits(contact)
 
     sizes = (1, *constants.buffers) if constants.buffers else ()
-    in_buffer = partial(_collision_in_buffer, constants, now, touching, words)
-    on_list = partial(_collision, constants, now, touching, delays)
+    in_buffer = partial(_collision_in_buffer, constants, now, pairs, words)
+    on_list = partial(_collision, constants, now, pairs, delays)
     programs = [*(partial(in_buffer, size) for size in sizes), on_list]
     branch = jnp.sum(count_bits(words) > jnp.asarray([0, *sizes], jnp.int32), dtype=jnp.int32)
     collision = switch_replica(branch, _no_collision(now, delays), programs)
@@ -305,11 +315,11 @@ def collide(constants: Constants, now: Carry, needs_solve: Bool[Array, ""]) -> C
     )
     if collision.shift is None:
         return kicked
-    frame, velocities, pairs = displaced(
+    frame, velocities, motion = displaced(
         collision.shift, flow.shear_rate, now.lists, kicked.velocities, kicked.pairs
     )
     return kicked._replace(
-        lists=replace(now.lists, frame=frame), velocities=velocities, pairs=pairs
+        lists=replace(now.lists, frame=frame), velocities=velocities, pairs=motion
     )
 
 
@@ -323,50 +333,55 @@ def _no_collision(now: Carry, delays: Array | None) -> Collision:
 
 
 def _collision_in_buffer(
-    constants: Constants, now: Carry, touching: Touching, words: Array, size: int, active: Array
+    constants: Constants, now: Carry, pairs: ContactPairs, words: Array, size: int, active: Array
 ) -> Collision:
     """What no more than ``size`` contacts do; a single one is solved in closed form."""
-    if size > 1:
-        return _collision(constants, now, touching.compacted(size, words), None, active)
-    return _collision(
-        constants, now, touching.compacted(_SINGLE_SLOTS, words), None, active, single=True
-    )
+    single = size == 1
+    contacts = pairs.compacted(_SINGLE_SLOTS if single else size, words)
+    return _collision(constants, now, contacts, None, active, single)
 
 
 def _collision(
     constants: Constants,
     now: Carry,
-    touching: Touching,
+    pairs: ContactPairs,
     delays: Array | None,
     active: Array,
     single: bool = False,
 ) -> Collision:
     """What contacts do, from their network and its solution."""
     flow, grains = constants.flow, constants.grains
-    network = touching.network(grains)
+    network = pairs.network(grains)
     operator = NetworkOperator(network, grains.radii.size)
     if single:
         solution = single_contact(operator)
     else:
         solution = solve(operator, flow.shear_rate, constants.solver, active)
-    impulses = impulses_of(flow, network, grains, solution)
-    contact_sums, largest_overlap = sums_of_contacts(flow, touching.reach, network, impulses)
+    contacts, momenta = solved_contacts(flow, pairs.reach, network, grains, solution)
     user_sums, observe_now = now.sums.user_sums, observer_of(constants, now)
     if observe_now is not None:
-        user_sums = with_contacts(user_sums, observe_now, network, impulses.contacts)
-    shift = None if delays is None else delayed_shift(delays, network, grains, impulses)
-    outcome = solution.iterations, solution.residual, solution.status
-    return Collision(impulses.grains, contact_sums, largest_overlap, *outcome, user_sums, shift)
+        user_sums = with_contacts(user_sums, observe_now, network, contacts.impulse)
+    return Collision(
+        momenta=momenta,
+        contact_sums=jnp.stack(sums_of(contact_terms(contacts))),
+        largest_overlap=jnp.max(contacts.overlap),
+        iterations=solution.iterations,
+        residual=solution.residual,
+        status=solution.status,
+        user_sums=user_sums,
+        shift=None if delays is None else delayed_shift(delays, network, grains, contacts),
+    )
 
 
 def _with_collision(sums: RunningSums, collision: Collision, acts: Array) -> RunningSums:
     """The sums with what the contacts of one step add."""
-    solves = acts, collision.iterations, collision.status != Status.ok
-    largest_values = jnp.stack([collision.largest_overlap, collision.residual])
-    added = sums.with_sums(
-        contact=sums.of(CONTACT) + collision.contact_sums,
-        solve=sums.of(SOLVE) + jnp.stack([x.astype(sums.numbers.dtype) for x in solves]),
-        largest=jnp.maximum(sums.of(LARGEST), largest_values),
+    added = sums.added(
+        collision.contact_sums,
+        solves=acts,
+        iterations=collision.iterations,
+        unconverged=collision.status != Status.ok,
+        largest_overlap=collision.largest_overlap,
+        worst_residual=collision.residual,
     )
     status = jnp.maximum(sums.status, collision.status)
     return added._replace(status=status, user_sums=collision.user_sums)

@@ -59,7 +59,7 @@ from jaxgran.dynamics.numba_engine.layout import (
     THREADS,
     VELOCITIES,
 )
-from jaxgran.dynamics.numba_engine.loop import advance_loop
+from jaxgran.dynamics.numba_engine.loop import time_loop
 
 API_MAJOR, API_MINOR = 0, 2
 EXTENSION_START, ARGS, RETS = 1, 9, 14  # words of a call frame
@@ -174,6 +174,34 @@ def _start_threads(address, frame, shared):
     return job, last
 
 
+@njit
+def _advance_replicas(job, frame, shared):
+    """Advance one replica after another, until all are taken."""
+    args, rets = frame[ARGS], frame[RETS]
+    replicas, blocks, _ = _lengths(rets, BLOCKS)
+    _, room, record = _lengths(rets, RECORDS)
+    grains = _lengths(rets, NEW_POSITIONS)[1]
+    of_next = job.ctypes.data + 8 * _NEXT
+    replica = _fetch_and_increment(of_next)
+    while replica < replicas:
+        time_loop(
+            _doubles(args, POSITIONS, replica, (grains, 2)),
+            _doubles(args, VELOCITIES, replica, (grains, 2)),
+            _doubles(args, RADII, replica, (grains,)),
+            _doubles(args, MASSES, replica, (grains,)),
+            carray(_data(args, NUMBERS_GIVEN, replica, INPUT_NUMBERS), 1, INPUTS)[0],
+            _doubles(args, STEPS, replica, (blocks,)),
+            _doubles(args, BEGIN, replica, (RESULTS,)),
+            _doubles(rets, NEW_POSITIONS, replica, (grains, 2)),
+            _doubles(rets, NEW_VELOCITIES, replica, (grains, 2)),
+            _doubles(rets, BLOCKS, replica, (blocks, RESULTS)),
+            _doubles(rets, RECORDS, replica, (room, record)),
+            arrays_of(grains),
+            shared,
+        )
+        replica = _fetch_and_increment(of_next)
+
+
 def handler(address):
     """Advance all replicas of a call.
 
@@ -190,30 +218,10 @@ def handler(address):
         return 0
     else:
         job, last = _start_threads(address, frame, shared)
-    frame = _words(job[_FRAME], RETS + 1)
-    args, rets = frame[ARGS], frame[RETS]
-    replicas, blocks, _ = _lengths(rets, BLOCKS)
-    _, room, record = _lengths(rets, RECORDS)
-    grains = _lengths(rets, NEW_POSITIONS)[1]
-    of_next = job.ctypes.data + 8 * _NEXT
-    replica = _fetch_and_increment(of_next)
-    while replica < replicas:
-        advance_loop(
-            _doubles(args, POSITIONS, replica, (grains, 2)),
-            _doubles(args, VELOCITIES, replica, (grains, 2)),
-            _doubles(args, RADII, replica, (grains,)),
-            _doubles(args, MASSES, replica, (grains,)),
-            carray(_data(args, NUMBERS_GIVEN, replica, INPUT_NUMBERS), 1, INPUTS)[0],
-            _doubles(args, STEPS, replica, (blocks,)),
-            _doubles(args, BEGIN, replica, (RESULTS,)),
-            _doubles(rets, NEW_POSITIONS, replica, (grains, 2)),
-            _doubles(rets, NEW_VELOCITIES, replica, (grains, 2)),
-            _doubles(rets, BLOCKS, replica, (blocks, RESULTS)),
-            _doubles(rets, RECORDS, replica, (room, record)),
-            arrays_of(grains),
-            shared,
-        )
-        replica = _fetch_and_increment(of_next)
+    try:  # noqa: SIM105, numba compiles no context manager
+        _advance_replicas(job, _words(job[_FRAME], RETS + 1), shared)
+    except Exception:  # no memory: the other threads go on, and must end before this call does
+        pass
     for n in range(_JOB_WORDS, last):
         _join_thread(job[n], 0)
     return 0

@@ -75,7 +75,7 @@ _NARROWEST_SKIN = 0.05  # σ, the usual skin of a dense flow
 
 
 @njit
-def advance_loop(
+def time_loop(
     positions,
     velocities,
     radii,
