@@ -40,12 +40,7 @@ from jaxgran.dynamics.tally import RunningSums, Tally
 from jaxgran.dynamics.velocity_scales import readings
 from jaxgran.model.control_flow import any_replica
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.state import (
-    State,
-    kinetic_energy,
-    relative_momentum,
-    status_if_finite,
-)
+from jaxgran.model.state import State, kinetic_energy, relative_momentum, status_if_finite
 from jaxgran.model.status import Status
 
 T = TypeVar("T")

@@ -155,10 +155,10 @@ def without_contacts(observe_now: ObserveNow, dtype: jnp.dtype) -> Any:
 
 
 def _no_contacts(slots: int, dtype: jnp.dtype) -> Contacts:
-    zeros, none = jnp.zeros(slots, dtype), jnp.zeros(slots, jnp.int32)
+    zeros, grains = jnp.zeros(slots, dtype), jnp.zeros(slots, jnp.int32)
     return Contacts(
-        i=none,
-        j=none,
+        i=grains,
+        j=grains,
         normals=jnp.zeros((slots, 2), dtype),
         distances=jnp.ones(slots, dtype),
         approach=zeros,

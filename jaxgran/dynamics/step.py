@@ -191,9 +191,9 @@ def event(constants: Constants, now: Carry) -> Carry:
     needs_solve = active & (after_flight.step < constants.steps) & ~(expired & (jump > 0))
     collided = collide(constants, after_flight, needs_solve)
 
-    missing = near.overflow | (expired & needs_solve)
-    listed = jnp.where(missing, Status.capacity, Status.ok)
-    status = jnp.where(jnp.isfinite(now.closing_speed), listed, Status.nonfinite).astype(jnp.int32)
+    missing = near.overflow | (expired & needs_solve)  # contacts, perhaps
+    status = jnp.where(missing, Status.capacity, Status.ok)
+    status = jnp.where(jnp.isfinite(now.closing_speed), status, Status.nonfinite).astype(jnp.int32)
     sums = collided.sums._replace(status=jnp.maximum(collided.sums.status, status))
     speed = closing_speed_bound(flow, constants.grains, collided.velocities, near.skin)
     after = collided._replace(closing_speed=speed, solved=needs_solve, sums=sums)
@@ -207,11 +207,11 @@ def _steps_to_fly(constants: Constants, now: Carry) -> Int[Array, ""]:
     flow, least = constants.flow, now.solved.astype(jnp.int32)
     time, closest = first_contact_time(now.pairs, now.lists.near.reach)
     steps = jnp.maximum(first_step(time, flow.timestep, flow.activation), least.astype(time.dtype))
-    to_contact = smallest(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
+    steps_to_contact = smallest(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
     longest = jnp.divide(LONGEST_FLIGHT, flow.shear_rate) / flow.timestep
-    of_list = now.slack / now.closing_speed / flow.timestep - flow.activation
-    possible = jnp.minimum(to_contact, jnp.floor(jnp.minimum(of_list, longest)))
-    jump = jnp.where(constants.free_flight, possible, 0)
+    steps_of_list = now.slack / now.closing_speed / flow.timestep - flow.activation
+    allowed = jnp.floor(jnp.minimum(steps_of_list, longest))
+    jump = jnp.where(constants.free_flight, jnp.minimum(steps_to_contact, allowed), 0)
     remaining = constants.steps - now.step
     return jnp.clip(
         jnp.minimum(jump, remaining.astype(jump.dtype)).astype(jnp.int32), least, remaining

@@ -21,12 +21,7 @@ from jaxgran.model.checks import (
     short_repr,
     two_digits,
 )
-from jaxgran.model.choices import (
-    MAX_GRAINS,
-    MAX_PACKING_FRACTION,
-    MAX_STEPS,
-    MIN_GRAINS,
-)
+from jaxgran.model.choices import MAX_GRAINS, MAX_PACKING_FRACTION, MAX_STEPS, MIN_GRAINS
 from jaxgran.model.values import Indexable
 
 _FASTEST = 1e100  # shear rate; the square and cube of it and of its inverse are finite in float64

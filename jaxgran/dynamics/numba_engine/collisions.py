@@ -6,13 +6,7 @@ import numpy as np
 
 from jaxgran.dynamics.numba_engine.cluster_solver import solve_cluster
 from jaxgran.dynamics.numba_engine.compilation import LAW, njit
-from jaxgran.dynamics.numba_engine.layout import (
-    EPSILON,
-    FIRST,
-    OK,
-    SECOND,
-    STRIKES,
-)
+from jaxgran.dynamics.numba_engine.layout import EPSILON, FIRST, OK, SECOND, STRIKES
 from jaxgran.dynamics.numba_engine.network import (
     find_clusters,
     make_network,
