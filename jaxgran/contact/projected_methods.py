@@ -40,7 +40,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import DelassusOperator
 from jaxgran.contact.law import LONGEST_STRIDE, PROGRESS, WINDOW
-from jaxgran.model.checks import InputError, concrete_or_none, require_number, short_repr
+from jaxgran.model.checks import InputError, concrete_or_none, refused, require_number
 from jaxgran.model.choices import SolverName
 from jaxgran.model.values import register_fields
 
@@ -108,19 +108,13 @@ class ProjectedMethod:
         register_fields(cls)
 
     def __post_init__(self) -> None:
-        require_number(
-            "tolerance",
-            self.tolerance,
-            lambda x: (x >= 1e-12) & (x <= 0.1),
-            "between 1e-12 and 0.1",
-        )
-        words = "a whole number of at least 1"
-        require_number(
-            "max_steps",
-            self.max_steps,
-            lambda x: (x >= 1) & (x <= 2**31 - 1) & (x == np.floor(x)),
-            words,
-        )
+        words = "between 1e-12 and 0.1"
+        require_number("tolerance", self.tolerance, lambda x: (x >= 1e-12) & (x <= 0.1), words)
+
+        def is_whole(x: np.ndarray) -> Any:
+            return (x >= 1) & (x <= 2**31 - 1) & (x == np.floor(x))
+
+        require_number("max_steps", self.max_steps, is_whole, "a whole number of at least 1")
 
     def bound(self, operator: DelassusOperator) -> Float[Array, " contacts"]:
         """Diagonal D of positive numbers in place of W, see ``delassus``."""
@@ -275,12 +269,8 @@ class Jacobi(ProjectedMethod):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_number(
-            "relaxation",
-            self.relaxation,
-            lambda x: (x > 0) & (x < 2),
-            "between 0 and 2, both excluded",
-        )
+        words = "between 0 and 2, both excluded"
+        require_number("relaxation", self.relaxation, lambda x: (x > 0) & (x < 2), words)
 
     def propose(self, now: Iterate) -> tuple[Array, Array]:
         return now.point, jnp.asarray(self.relaxation, now.point.dtype)
@@ -337,10 +327,8 @@ def _in_json(value: Any) -> Any:
 def require_solver(solver: Any) -> None:
     """Raise an InputError unless this is a projected method."""
     if not isinstance(solver, ProjectedMethod):
-        raise InputError(
-            "solver must be a ProjectedMethod, such as jg.BarzilaiBorwein(), not "
-            f"{short_repr(solver)}."
-        )
+        words = "must be a ProjectedMethod, such as jg.BarzilaiBorwein()"
+        raise refused("solver", solver, words)
 
 
 def dot(a: Float[Array, " contacts"], b: Float[Array, " contacts"]) -> Float[Array, ""]:

@@ -15,6 +15,7 @@ from jaxgran.model.checks import (
     as_array,
     concrete_or_none,
     is_traced,
+    refused,
     require,
     require_number,
     require_whole,
@@ -218,7 +219,7 @@ def require_flow(flow: Any) -> None:
 def _shapes_of(flow: Any) -> set[tuple[int, ...]]:
     """The shapes of the arrays of a flow; none for a single one. InputError for anything else."""
     if not isinstance(flow, ShearFlow):
-        raise InputError(f"flow must be a ShearFlow, not {short_repr(flow)}.")
+        raise refused("flow", flow, "must be a ShearFlow")
     return {*map(np.shape, jax.tree.leaves(flow))} - {()}
 
 
