@@ -47,12 +47,10 @@ def add_flight(sums, steps, flight, strain, kinetic):
 
 
 @njit
-def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
-    """Add what the contacts of one step contribute, by the law of a contact; ``step_sums`` is
-    memory for it.
-    """
+def add_contacts(sums, contacts, one_plus_alpha, grains, network):
+    """Add what the contacts of one step contribute, by the law of a contact."""
     ends, rows, constants = network.ends, network.rows, grains.constants
-    impulses, loaded = network.impulses, network.loaded
+    impulses, loaded, step_sums = network.impulses, network.loaded, network.step_sums
     for n in range(_PADDED):
         step_sums[n] = 0.0
     for c in range(contacts):
