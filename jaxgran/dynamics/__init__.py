@@ -6,7 +6,7 @@ the reference. Who calls whom, from ``jg.sample`` and ``jg.advance`` down to the
     advance.advance_replica              one replica, by the engine of ``advance.engine_of``
         engine.Jax.advance               batches and derivatives of
             jax_engine.advance_by_jax    blocks of steps, each a loop over events
-                step.event               new velocities and sums by ``step.fly``, ``step.collide``
+                step.event               new velocities and sums by ``fly`` and ``collide``
         engine.Numba.advance
             numba_engine.observed.advance_by_numba
                 numba_engine.call.advance_unobserved    all blocks by one call of XLA, or, where a

@@ -26,16 +26,9 @@ from jaxtyping import Array, Int
 
 from jaxgran.contact.near_pairs import present
 from jaxgran.contact.projected_methods import ProjectedMethod
+from jaxgran.dynamics.carry import Carry, Constants, start
 from jaxgran.dynamics.observer import Observe
-from jaxgran.dynamics.step import (
-    Carry,
-    Constants,
-    event,
-    needs_lists,
-    refresh_lists,
-    start,
-    unfinished,
-)
+from jaxgran.dynamics.step import event, needs_lists, refresh_lists, unfinished
 from jaxgran.dynamics.tally import RunningSums, Tally
 from jaxgran.dynamics.velocity_scales import readings
 from jaxgran.model.control_flow import any_replica

@@ -7,8 +7,7 @@ Its functions take what does not change (``Constants``) and what does (``Carry``
 - ``event``: a flight up to the step in which some pair next becomes an approaching contact, and
   the contacts of that step.
 - ``fly``: free flight over a number of steps.
-- ``collide``: the contacts of one step change the velocities: the near list becomes a buffer of
-  ``ContactPairs``, these a network of ``Contacts``, and their solution a ``Collision``.
+- ``collide`` of ``collisions``: the contacts of one step change the velocities.
 
 How long a near list is valid. It holds every pair whose gap was at most its skin s when it was
 built. With V a bound on how fast a gap closes (``closing_speed_bound``), which changes with every
@@ -25,108 +24,36 @@ In a batch, a replica that is finished or has no step to solve keeps what it has
 """
 
 from dataclasses import replace
-from functools import partial
-from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxgran.contact.compaction import count_bits, pack_bits
-from jaxgran.contact.delassus import NetworkOperator
-from jaxgran.contact.law import contact_terms, first_step, flight_of, kinetic_means
+from jaxgran.contact.law import first_step, flight_of, kinetic_means
 from jaxgran.contact.near_pairs import (
     Frame,
-    PairLists,
-    no_lists,
-    present,
     refresh,
     separations_now,
 )
 from jaxgran.contact.network import (
-    ContactPairs,
-    PairMotion,
     first_contact_time,
-    is_contact,
     pair_motion,
 )
-from jaxgran.contact.projected_methods import ProjectedMethod
-from jaxgran.contact.solver import single_contact, solve
-from jaxgran.dynamics.contact_sums import solved_contacts
-from jaxgran.dynamics.moving_contacts import contact_delays, delayed_shift, displaced, is_binary
+from jaxgran.dynamics.carry import Carry, Constants, observer_of, state_of
+from jaxgran.dynamics.collisions import collide
 from jaxgran.dynamics.observer import (
-    Observe,
-    ObserveNow,
     middle_of_flight,
-    nothing_observed,
-    observe_at,
-    with_contacts,
     with_flight,
 )
-from jaxgran.dynamics.tally import CONTACT, RunningSums, empty_sums
+from jaxgran.dynamics.tally import RunningSums
 from jaxgran.dynamics.velocity_scales import READ_AFTER, readings
-from jaxgran.model.control_flow import any_replica, switch_replica, where_active
+from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
-from jaxgran.model.indexing import taken
-from jaxgran.model.reductions import largest, smallest, sums_of
-from jaxgran.model.state import State, status_at_start
+from jaxgran.model.reductions import largest, smallest
 from jaxgran.model.status import Status
 
 LONGEST_FLIGHT = 0.05  # strain; a bound on the change of the peculiar velocities within one flight
-_SINGLE_SLOTS = 4  # for one contact: in one slot XLA would compute the terms once for each sum
-
-
-class Constants(NamedTuple):
-    """What does not change in an advance; the last four are static."""
-
-    flow: ShearFlow
-    grains: Grains
-    side: Float[Array, ""]
-    steps: Int[Array, ""]  # to fly in all
-    solver: ProjectedMethod
-    free_flight: bool = True  # whether steps without an approaching contact are jumped over
-    # Numbers of contacts for which a solve is compiled, smallest first, beside that of all pairs;
-    # none in loops for derivatives
-    buffers: tuple[int, ...] = ()
-    moving_contacts: bool = False  # whether derivatives include that a contact moves in time
-    observe: Observe | None = None
-
-
-class Carry(NamedTuple):
-    """What an event changes."""
-
-    lists: PairLists
-    pairs: PairMotion  # of the near list
-    slack: Float[Array, ""]  # of the near list, see the module
-    closing_speed: Float[Array, ""]  # bound on how fast any gap closes
-    velocities: Float[Array, "grains 2"]
-    step: Int[Array, ""]  # steps flown
-    solved: Bool[Array, ""]  # whether the contacts of the present step have been dealt with
-    sums: RunningSums
-    collisions_read: Float[Array, ""]  # collisions until the last reading of the velocity scales
-
-
-def start(constants: Constants, state: State) -> Carry:
-    """The carry before the first step, without lists."""
-    lists, dtype = no_lists(state.positions, state.tilt), state.positions.dtype
-    sums = empty_sums(dtype)._replace(status=status_at_start(constants.flow, state))
-    now = Carry(
-        lists=lists,
-        pairs=PairMotion(*4 * [jnp.zeros_like(lists.near.reach)]),
-        slack=lists.near.skin,
-        closing_speed=jnp.full_like(constants.side, jnp.inf),  # so that the lists are stale
-        velocities=state.velocities,
-        step=jnp.int32(0),
-        solved=jnp.bool_(False),
-        sums=sums,
-        collisions_read=jnp.zeros_like(constants.side),
-    )
-    observe_now = observer_of(constants, now)
-    if observe_now is None:
-        return now
-    nothing = nothing_observed(observe_now, lists.near.reach.size, dtype)
-    return now._replace(sums=sums._replace(user_sums=nothing))
 
 
 def unfinished(constants: Constants, now: Carry) -> Bool[Array, ""]:
@@ -185,9 +112,9 @@ def event(constants: Constants, now: Carry) -> Carry:
     jump = _steps_to_fly(constants, now)
     after_flight = fly(constants, now, jump)
 
-    slack = after_flight.slack - now.closing_speed * flow.activation * flow.timestep
-    rounding = 16 * jnp.finfo(slack.dtype).eps * near.skin  # summed over flights
-    expired = slack < -rounding
+    needed = now.closing_speed * flow.activation * flow.timestep
+    rounding = 16 * jnp.finfo(near.skin.dtype).eps * near.skin  # of the slack, summed over flights
+    expired = after_flight.slack - needed < -rounding
     needs_solve = active & (after_flight.step < constants.steps) & ~(expired & (jump > 0))
     collided = collide(constants, after_flight, needs_solve)
 
@@ -268,137 +195,6 @@ def _with_flight(
     return sums.added(duration=time, steps=steps, kinetic_moment=[time * mean for mean in means])
 
 
-class Collision(NamedTuple):
-    """What the contacts of one step do to the grains, and what they add to the sums."""
-
-    momenta: Float[Array, "grains 2"]
-    contact_sums: Float[Array, " contact"]
-    largest_overlap: Float[Array, ""]
-    iterations: Int[Array, ""]
-    residual: Float[Array, ""]
-    status: Int[Array, ""]
-    user_sums: Any
-    shift: Float[Array, "grains 2"] | None  # of ``moving_contacts``
-
-
-def collide(constants: Constants, now: Carry, needs_solve: Bool[Array, ""]) -> Carry:
-    """The contacts of one step change the velocities; not where none approaches or no step needs
-    it.
-
-    The contacts are compacted from the near list into the smallest buffer that holds them, and
-    solved and summed there; more than the largest buffer holds are solved and summed on the list.
-    """
-    near, grains, flow = now.lists.near, constants.grains, constants.flow
-    look_ahead = flow.activation * flow.timestep
-    all_contacts, approaching = is_contact(now.pairs, near.reach, look_ahead)
-    acts = needs_solve & jnp.any(pack_bits(approaching) > 0)
-    contact, motion, delays = all_contacts & acts, now.pairs, None
-    if constants.moving_contacts:
-        delays = contact_delays(now.pairs, near.reach, approaching, flow.timestep)
-        motion = now.pairs.moved(jnp.where(is_binary(near, contact, grains), delays, 0))
-    pairs, words = ContactPairs(near.i, near.j, near.reach, motion, contact), pack_bits(contact)
-
-    sizes = (1, *constants.buffers) if constants.buffers else ()
-    in_buffer = partial(_collision_in_buffer, constants, now, pairs, words)
-    on_list = partial(_collision, constants, now, pairs, delays)
-    programs = [*(partial(in_buffer, size) for size in sizes), on_list]
-    branch = jnp.sum(count_bits(words) > jnp.asarray([0, *sizes], jnp.int32), dtype=jnp.int32)
-    collision = switch_replica(branch, _no_collision(now, delays), programs)
-
-    kicks = collision.momenta / grains.masses[:, None]
-    x, y = kicks.T
-    ux, uy = (taken(a, near.i) - taken(a, near.j) for a in (x, y))
-    kicked = now._replace(
-        pairs=now.pairs._replace(ux=now.pairs.ux + ux, uy=now.pairs.uy + uy),
-        velocities=now.velocities + kicks,
-        sums=_with_collision(now.sums, collision, acts),
-    )
-    if collision.shift is None:
-        return kicked
-    frame, velocities, motion = displaced(
-        collision.shift, flow.shear_rate, now.lists, kicked.velocities, kicked.pairs
-    )
-    return kicked._replace(
-        lists=replace(now.lists, frame=frame), velocities=velocities, pairs=motion
-    )
-
-
-def _no_collision(now: Carry, delays: Array | None) -> Collision:
-    """No contact approaches."""
-    still, zero = jnp.zeros_like(now.velocities), jnp.zeros_like(now.slack)
-    no_sums, shift = jnp.zeros_like(now.sums.of(CONTACT)), None if delays is None else still
-    return Collision(
-        still, no_sums, zero, jnp.int32(0), zero, jnp.int32(0), now.sums.user_sums, shift
-    )
-
-
-def _collision_in_buffer(
-    constants: Constants, now: Carry, pairs: ContactPairs, words: Array, size: int, active: Array
-) -> Collision:
-    """What no more than ``size`` contacts do; a single one is solved in closed form."""
-    single = size == 1
-    contacts = pairs.compacted(_SINGLE_SLOTS if single else size, words)
-    return _collision(constants, now, contacts, None, active, single)
-
-
-def _collision(
-    constants: Constants,
-    now: Carry,
-    pairs: ContactPairs,
-    delays: Array | None,
-    active: Array,
-    single: bool = False,
-) -> Collision:
-    """What contacts do, from their network and its solution."""
-    flow, grains = constants.flow, constants.grains
-    network = pairs.network(grains)
-    operator = NetworkOperator(network, grains.radii.size)
-    if single:
-        solution = single_contact(operator)
-    else:
-        solution = solve(operator, flow.shear_rate, constants.solver, active)
-    contacts, momenta = solved_contacts(flow, pairs.reach, network, grains, solution)
-    user_sums, observe_now = now.sums.user_sums, observer_of(constants, now)
-    if observe_now is not None:
-        user_sums = with_contacts(user_sums, observe_now, network, contacts.impulse)
-    return Collision(
-        momenta=momenta,
-        contact_sums=jnp.stack(sums_of(contact_terms(contacts))),
-        largest_overlap=jnp.max(contacts.overlap),
-        iterations=solution.iterations,
-        residual=solution.residual,
-        status=solution.status,
-        user_sums=user_sums,
-        shift=None if delays is None else delayed_shift(delays, network, grains, contacts),
-    )
-
-
-def _with_collision(sums: RunningSums, collision: Collision, acts: Array) -> RunningSums:
-    """The sums with what the contacts of one step add."""
-    added = sums.added(
-        collision.contact_sums,
-        solves=acts,
-        iterations=collision.iterations,
-        unconverged=collision.status != Status.ok,
-        largest_overlap=collision.largest_overlap,
-        worst_residual=collision.residual,
-    )
-    status = jnp.maximum(sums.status, collision.status)
-    return added._replace(status=status, user_sums=collision.user_sums)
-
-
-def observer_of(constants: Constants, now: Carry) -> ObserveNow | None:
-    """What the user observes now, given contacts and impulses; None where nothing is observed."""
-    if constants.observe is None:
-        return None
-    return observe_at(constants.observe, constants.flow, _state_of(constants, now))
-
-
-def _state_of(constants: Constants, now: Carry) -> State:
-    positions, tilt = present(now.lists, constants.side)
-    return State(constants.grains, positions, now.velocities, constants.side, tilt)
-
-
 def _with_readings(constants: Constants, now: Carry) -> Carry:
     """With readings of the velocity scales where it is time for some."""
     if not constants.buffers:  # loops for derivatives are too short for a second reading
@@ -407,7 +203,7 @@ def _with_readings(constants: Constants, now: Carry) -> Carry:
     due = sums.value("collisions") - collisions_read >= READ_AFTER * constants.grains.radii.size / 2
 
     def read() -> tuple[RunningSums, Array]:
-        state = _state_of(constants, now)
+        state = state_of(constants, now)
         read_now = sums.with_reading(readings(state)), sums.value("collisions")
         return where_active(due, read_now, (sums, collisions_read))
 
