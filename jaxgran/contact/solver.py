@@ -66,10 +66,7 @@ def natural_map(
 
 @jax.custom_jvp
 def solve(
-    operator: DelassusOperator,
-    shear_rate: float | Array,
-    solver: ProjectedMethod,
-    active: Array,
+    operator: DelassusOperator, shear_rate: float | Array, solver: ProjectedMethod, active: Array
 ) -> Solution:
     """Impulses J₀ of the network at restitution zero: 0 ≤ J₀ ⟂ W J₀ + u⁻ ≥ 0.
 

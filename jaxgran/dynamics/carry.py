@@ -5,21 +5,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxgran.contact.near_pairs import (
-    PairLists,
-    no_lists,
-    present,
-)
-from jaxgran.contact.network import (
-    PairMotion,
-)
+from jaxgran.contact.near_pairs import PairLists, no_lists, present
+from jaxgran.contact.network import PairMotion
 from jaxgran.contact.projected_methods import ProjectedMethod
-from jaxgran.dynamics.observer import (
-    Observe,
-    ObserveNow,
-    nothing_observed,
-    observe_at,
-)
+from jaxgran.dynamics.observer import Observe, ObserveNow, nothing_observed, observe_at
 from jaxgran.dynamics.tally import RunningSums, empty_sums
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains

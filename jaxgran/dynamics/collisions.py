@@ -12,17 +12,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxgran.contact.compaction import count_bits, pack_bits
 from jaxgran.contact.delassus import NetworkOperator, loads_of_grains
 from jaxgran.contact.law import SolvedContact, contact_terms
-from jaxgran.contact.network import (
-    ContactPairs,
-    Contacts,
-    is_contact,
-)
+from jaxgran.contact.network import ContactPairs, Contacts, is_contact
 from jaxgran.contact.solver import Solution, single_contact, solve
 from jaxgran.dynamics.carry import Carry, Constants, observer_of
 from jaxgran.dynamics.moving_contacts import contact_delays, delayed_shift, displaced, is_binary
-from jaxgran.dynamics.observer import (
-    with_contacts,
-)
+from jaxgran.dynamics.observer import with_contacts
 from jaxgran.dynamics.tally import CONTACT, RunningSums
 from jaxgran.model.control_flow import switch_replica
 from jaxgran.model.flow import ShearFlow

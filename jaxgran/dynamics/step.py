@@ -30,21 +30,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.contact.law import first_step, flight_of, kinetic_means
-from jaxgran.contact.near_pairs import (
-    Frame,
-    refresh,
-    separations_now,
-)
-from jaxgran.contact.network import (
-    first_contact_time,
-    pair_motion,
-)
+from jaxgran.contact.near_pairs import Frame, refresh, separations_now
+from jaxgran.contact.network import first_contact_time, pair_motion
 from jaxgran.dynamics.carry import Carry, Constants, observer_of, state_of
 from jaxgran.dynamics.collisions import collide
-from jaxgran.dynamics.observer import (
-    middle_of_flight,
-    with_flight,
-)
+from jaxgran.dynamics.observer import middle_of_flight, with_flight
 from jaxgran.dynamics.tally import RunningSums
 from jaxgran.dynamics.velocity_scales import READ_AFTER, readings
 from jaxgran.model.control_flow import any_replica, where_active
