@@ -189,11 +189,8 @@ def predicted_cost(flow: ShearFlow, timestep: Any = None) -> Any:
     networks; the second factor is their cost at dt = 1e-3. Steps without a contact are jumped over,
     so ten times as many steps cost little more than twice as much.
     """
-    numbers = (
-        flow.restitution,
-        flow.packing_fraction,
-        flow.timestep if timestep is None else timestep,
-    )
+    timestep = flow.timestep if timestep is None else timestep
+    numbers = flow.restitution, flow.packing_fraction, timestep
     alpha, nu, dt = (np.asarray(x, float) for x in numbers)
     network = 8 + 600 * (1 - alpha) * np.exp((nu - 0.8) / 0.04)
     return flow.grains * network * (1e-3 / dt) ** 0.35

@@ -103,11 +103,8 @@ def _pairs_of_cells(pairs, side, tilt, rows, columns, skin, capacity):
                 i, x, y = sorted_grains[m], places[0, m] - image_x, places[1, m] - image_y
                 radius_and_skin = places[2, m] + skin
                 for n in range(m + 1 if part == 0 else begin, end):
-                    dx, dy, reach = (
-                        x - places[0, n],
-                        y - places[1, n],
-                        radius_and_skin + places[2, n],
-                    )
+                    dx, dy = x - places[0, n], y - places[1, n]
+                    reach = radius_and_skin + places[2, n]
                     # without a branch, which would be mispredicted
                     p = np.uint64(min(count, capacity))
                     ends[FIRST, p], ends[SECOND, p] = i, sorted_grains[n]
