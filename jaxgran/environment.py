@@ -38,19 +38,30 @@ def processor(*entries: str) -> str:
     return platform.processor() or "unknown"
 
 
-def usable_cores(root: Path = Path("/sys/fs/cgroup")) -> int:
+def usable_cores(root: Path = Path("/")) -> int:
     """Number of cores that this process may use: those of its affinity, or fewer where a control
     group, such as that of a container, has a quota of processor time.
     """
     affinity = getattr(os, "sched_getaffinity", None)
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1
     with suppress(OSError):
-        group = root / Path("/proc/self/cgroup").read_text().rpartition("::")[2].strip().strip("/")
-        for folder in (group, *group.parents):
-            with suppress(OSError, ValueError):  # no quota is "max"
-                quota, period = map(int, (folder / "cpu.max").read_text().split())
-                cores = min(cores, max(1, math.ceil(quota / period)))
-    return cores
+        for line in (root / "proc/self/cgroup").read_text().splitlines():
+            _, controllers, path = line.split(":", 2)  # no controllers: version 2
+            version_1 = "cpu" in controllers.split(",")
+            group = root / "sys/fs/cgroup" / ("cpu" if version_1 else "") / path.strip("/")
+            for folder in (group, *group.parents):
+                cores = min(cores, _cores_of_quota(folder))
+    return math.ceil(cores)
+
+
+def _cores_of_quota(folder: Path) -> float:
+    """What the quota of a control group, of version 2 or 1, is worth; infinite without one."""
+    for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
+        with suppress(OSError, ValueError):  # no quota is "max" or -1
+            quota, period = map(int, " ".join((folder / x).read_text() for x in names).split())
+            if quota > 0:
+                return quota / period
+    return math.inf
 
 
 def usable_threads() -> int:

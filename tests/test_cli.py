@@ -384,6 +384,22 @@ def test_a_reader_that_has_gone_ends_a_command_in_silence(words: str, tmp_path: 
         assert (process.stderr.read(), process.wait()) == (b"", 1)
 
 
+@pytest.mark.skipif(os.name != "posix", reason="a shell of another kind")
+@pytest.mark.parametrize(
+    "words",
+    [
+        "info",
+        "where --restitution 0.5 --packing-fraction 0.6",
+        "run --restitution 0.5 --packing-fraction 0.6 -n 16 --strain 1 --equilibrate 0.1",
+    ],
+)
+def test_a_command_without_a_standard_output_ends_as_ever(words: str, tmp_path: Path) -> None:
+    """As in ``jaxgran info >&-``."""
+    command = ["sh", "-c", f'exec "$0" -m jaxgran {words} >&-', sys.executable]
+    done = subprocess.run(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    assert done.returncode in (0, 3) and "Traceback" not in done.stderr
+
+
 def test_run_prints_a_column_for_each_number_of_grains(tmp_path: Path) -> None:
     words = "run --restitution 0.7 --packing-fraction 0.6 -n 32,64 --strain 1 --equilibrate 1"
     outcome = jaxgran(tmp_path, *words.split(), "--output", "flow.nc")

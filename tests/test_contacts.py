@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from jaxgran.contact.network import PairMotion, Touching, first_contact_time, is_contact
+from jaxgran.contact.network import ContactPairs, PairMotion, first_contact_time, is_contact
 from jaxgran.model.grains import Grains
 
 EPS = np.finfo(float).eps
@@ -18,7 +18,7 @@ seeds = given(st.integers(0, 2**32 - 1))
 modest = settings(max_examples=20)
 
 compiled_rule, compiled_time, compiled_network = map(
-    jax.jit, (is_contact, first_contact_time, Touching.network)
+    jax.jit, (is_contact, first_contact_time, ContactPairs.network)
 )
 
 
@@ -117,7 +117,7 @@ def test_network_holds_its_contacts_and_its_empty_slots_are_inert(slots):
     picked = np.array([200, 3, 77])
     index = np.concatenate([picked, np.zeros(slots - 3, int)])
     pairs = motion(separations[index], velocities[index])
-    touching = Touching(i[index], j[index], np.ones(slots), pairs, np.arange(slots) < 3)
+    touching = ContactPairs(i[index], j[index], np.ones(slots), pairs, np.arange(slots) < 3)
     network = jax.tree.map(np.asarray, compiled_network(touching, grains))
     np.testing.assert_array_equal(network.used, np.arange(slots) < 3)
     np.testing.assert_array_equal(network.i[:3], i[picked])

@@ -37,11 +37,28 @@ def test_another_partition_of_random_bits_is_another_generator() -> None:
         assert random_bits() != here
 
 
-def test_a_quota_of_one_core_is_one_thread(tmp_path: Path) -> None:
-    (tmp_path / "cpu.max").write_text("100000 100000\n")
-    assert usable_cores(tmp_path) == 1
-    (tmp_path / "cpu.max").write_text("max 100000\n")
-    assert usable_cores(tmp_path) == usable_cores()
+@pytest.mark.parametrize(
+    ("groups", "folder", "limited", "unlimited"),
+    [
+        ("0::/user/job", "user", {"cpu.max": "100000 100000"}, {"cpu.max": "max 100000"}),
+        (
+            "7:memory:/job\n4:cpu,cpuacct:/job\n0::/",
+            "cpu/job",
+            {"cpu.cfs_quota_us": "50000", "cpu.cfs_period_us": "100000"},
+            {"cpu.cfs_quota_us": "-1", "cpu.cfs_period_us": "100000"},
+        ),
+    ],
+    ids=["version 2, of the group above", "version 1"],
+)
+def test_a_quota_of_one_core_is_one_thread(groups, folder, limited, unlimited, tmp_path) -> None:
+    files = {"proc/self/cgroup": groups}
+    for quota, cores in ((limited, 1), (unlimited, usable_cores())):
+        files |= {f"sys/fs/cgroup/{folder}/{name}": text for name, text in quota.items()}
+        for name, text in files.items():
+            path = tmp_path / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"{text}\n")
+        assert usable_cores(tmp_path) == cores
 
 
 def test_a_cache_in_a_bucket_is_no_folder_here() -> None:

@@ -1,7 +1,11 @@
 """A batch of the numba engine has the bits of its replicas alone, on any number of threads."""
 
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -84,3 +88,44 @@ def test_the_variable_of_numba_sets_the_number_of_threads(
 ) -> None:
     monkeypatch.setenv("NUMBA_NUM_THREADS", asked)
     assert usable_threads() == expected
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no list of the threads of a process")
+def test_no_thread_outlives_a_call_that_lacks_memory(tmp_path: Path) -> None:
+    """Memory for one replica of six: none of the threads that have none may end the call before
+    the others end.
+    """
+    script = """
+import os, resource
+import jax, numpy as np
+import jaxgran as jg
+from jaxgran.model.status import Status
+
+jax.config.update("jax_enable_x64", True)
+count, replicas = 100_000, 6
+across = int(np.ceil(np.sqrt(count)))
+positions = 1.25 * np.stack(np.divmod(np.arange(count), across), axis=-1)
+velocities = np.random.default_rng(0).normal(size=(count, 2))
+grains = jg.Grains(np.full(count, 0.5), np.ones(count))
+state = jg.State(grains, positions, velocities, 1.25 * across, 0.0)
+flow = jg.ShearFlow(count, 0.9, float(state.packing_fraction), 1e-3)
+
+def status(state, steps):
+    return jg.advance(flow, state, steps, engine=jg.Numba())[1].status
+
+over_steps = jax.jit(jax.vmap(status, (None, 0)))
+arguments = jax.device_put((state, np.full(replicas, 20)))
+advanced = over_steps.lower(*arguments).compile()
+pages = int(open("/proc/self/statm").read().split()[0])
+most = pages * resource.getpagesize() + 440 * 2**20
+resource.setrlimit(resource.RLIMIT_AS, (most, most))
+threads = len(os.listdir("/proc/self/task"))
+statuses = np.asarray(advanced(*arguments)).tolist()
+assert len(os.listdir("/proc/self/task")) <= threads, "a thread goes on"
+# of a replica without memory nothing is written, which may be anything
+assert set(statuses) <= {Status.ok, Status.capacity, Status.nonfinite}, statuses
+"""
+    environment = {**os.environ, "NUMBA_NUM_THREADS": "6"}
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")

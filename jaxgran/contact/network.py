@@ -131,29 +131,38 @@ def first_contact_time(
     return jnp.where(touches, time, jnp.inf), closest
 
 
-class Touching(NamedTuple):
-    """The pairs of the near list, or those compacted from it, (pairs,) each, and which of them are
-    contacts.
+class ContactPairs(NamedTuple):
+    """The pairs of a list, (pairs,) each, and which of them are contacts; or a buffer of contacts
+    that are compacted from such a list.
+
+    ======  ==========  ====  ===============================
+    field   shape       unit  meaning
+    ======  ==========  ====  ===============================
+    i, j    (pairs,)    –     grains of the pair
+    reach   (pairs,)    σ     sum of the radii
+    motion  PairMotion  –     how the pairs move
+    used    (pairs,)    –     True where the pair is a contact
+    ======  ==========  ====  ===============================
     """
 
     i: Int[Array, " pairs"]
     j: Int[Array, " pairs"]
     reach: Float[Array, " pairs"]
     motion: PairMotion
-    contact: Bool[Array, " pairs"]
+    used: Bool[Array, " pairs"]
 
-    def compacted(self, size: int, words: Array) -> "Touching":
-        """The first contacts in a buffer of a size; ``words`` is ``pack_bits(contact)``."""
-        pairs = self.contact.size
+    def compacted(self, size: int, words: Array) -> "ContactPairs":
+        """The first contacts in a buffer of a size; ``words`` is ``pack_bits(used)``."""
+        pairs = self.used.size
         position = bit_positions(words, size, pairs)
         used = position < pairs
         index = jnp.where(used, position, 0)
         i, j, reach, motion = jax.tree.map(lambda x: taken(x, index), self[:-1])
-        return Touching(i, j, reach, motion, used)
+        return ContactPairs(i, j, reach, motion, used)
 
     def network(self, grains: Grains) -> Contacts:
         """The contact network, with a slot for each pair."""
-        pairs, used = self.motion, self.contact
+        pairs, used = self.motion, self.used
         distances = jnp.sqrt(pairs.x * pairs.x + pairs.y * pairs.y)
         inverse_distances, inverse_masses = jnp.where(used, 1 / distances, 0), 1 / grains.masses
         nx, ny = inverse_distances * pairs.x, inverse_distances * pairs.y

@@ -19,7 +19,14 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import NetworkOperator
 from jaxgran.contact.network import Contacts
-from jaxgran.model.checks import InputError, as_array, concrete_or_none, require, short_repr
+from jaxgran.model.checks import (
+    InputError,
+    as_array,
+    concrete_or_none,
+    refused,
+    require,
+    short_repr,
+)
 from jaxgran.model.values import Value
 
 LARGEST_FACTORED = 2048  # contacts of a matrix whose eigenvalues are checked, which takes 0.1 s
@@ -180,9 +187,7 @@ def check_problem(problem: Any) -> None:
     See ``solve_contacts`` for what is checked.
     """
     if not isinstance(problem, ContactNetwork | DelassusProblem):
-        raise InputError(
-            f"problem must be a ContactNetwork or a DelassusProblem, not {short_repr(problem)}."
-        )
+        raise refused("problem", problem, "must be a ContactNetwork or a DelassusProblem")
     if np.shape(problem.approach) == (0,):
         raise InputError(
             "approach must have a number for at least one contact: this problem has none to solve."

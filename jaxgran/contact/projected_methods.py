@@ -40,13 +40,15 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import DelassusOperator
 from jaxgran.contact.law import LONGEST_STRIDE, PROGRESS, WINDOW
-from jaxgran.model.checks import InputError, concrete_or_none, require_number, short_repr
+from jaxgran.model.checks import InputError, concrete_or_none, refused, require_number
 from jaxgran.model.choices import SolverName
 from jaxgran.model.values import register_fields
 
+IMPULSES, RESPONSE = range(2)  # rows of a point: J and W J
+
 
 class Iterate(NamedTuple):
-    """State of the iteration; a point holds impulses and their response W J."""
+    """State of the iteration."""
 
     point: Float[Array, "2 contacts"]
     previous: Float[Array, "2 contacts"]
@@ -106,19 +108,13 @@ class ProjectedMethod:
         register_fields(cls)
 
     def __post_init__(self) -> None:
-        require_number(
-            "tolerance",
-            self.tolerance,
-            lambda x: (x >= 1e-12) & (x <= 0.1),
-            "between 1e-12 and 0.1",
-        )
-        words = "a whole number of at least 1"
-        require_number(
-            "max_steps",
-            self.max_steps,
-            lambda x: (x >= 1) & (x <= 2**31 - 1) & (x == np.floor(x)),
-            words,
-        )
+        words = "between 1e-12 and 0.1"
+        require_number("tolerance", self.tolerance, lambda x: (x >= 1e-12) & (x <= 0.1), words)
+
+        def is_whole(x: np.ndarray) -> Any:
+            return (x >= 1) & (x <= 2**31 - 1) & (x == np.floor(x))
+
+        require_number("max_steps", self.max_steps, is_whole, "a whole number of at least 1")
 
     def bound(self, operator: DelassusOperator) -> Float[Array, " contacts"]:
         """Diagonal D of positive numbers in place of W, see ``delassus``."""
@@ -203,7 +199,7 @@ class BarzilaiBorwein(ProjectedMethod):
         along_step = is_long | guarded
         # One product for all cases: sᵀDs of a long step, (Ws)ᵀD⁻¹Ws of a short one, and the descent
         # of a guarded one, which is positive where the step turns uphill
-        scaled_step = bound * jnp.where(guarded, start[0] - point[0], step)
+        scaled_step = bound * jnp.where(guarded, start[IMPULSES] - point[IMPULSES], step)
         scaled = jnp.where(along_step, scaled_step, response / bound)
         square = dot(scaled, jnp.where(along_step, step, response))
         curvature = dot(step, response)  # sᵀWs
@@ -243,7 +239,8 @@ class Nesterov(ProjectedMethod):
     def learn(
         self, now: Iterate, start: Array, point: Array, bound: Array, best_residual: Array
     ) -> Any:
-        uphill = dot(bound * (start[0] - point[0]), point[0] - now.point[0]) > 0
+        step = point[IMPULSES] - now.point[IMPULSES]
+        uphill = dot(bound * (start[IMPULSES] - point[IMPULSES]), step) > 0
         return jnp.where(uphill, 0, now.memory + 1)
 
 
@@ -272,12 +269,8 @@ class Jacobi(ProjectedMethod):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_number(
-            "relaxation",
-            self.relaxation,
-            lambda x: (x > 0) & (x < 2),
-            "between 0 and 2, both excluded",
-        )
+        words = "between 0 and 2, both excluded"
+        require_number("relaxation", self.relaxation, lambda x: (x > 0) & (x < 2), words)
 
     def propose(self, now: Iterate) -> tuple[Array, Array]:
         return now.point, jnp.asarray(self.relaxation, now.point.dtype)
@@ -334,10 +327,8 @@ def _in_json(value: Any) -> Any:
 def require_solver(solver: Any) -> None:
     """Raise an InputError unless this is a projected method."""
     if not isinstance(solver, ProjectedMethod):
-        raise InputError(
-            "solver must be a ProjectedMethod, such as jg.BarzilaiBorwein(), not "
-            f"{short_repr(solver)}."
-        )
+        words = "must be a ProjectedMethod, such as jg.BarzilaiBorwein()"
+        raise refused("solver", solver, words)
 
 
 def dot(a: Float[Array, " contacts"], b: Float[Array, " contacts"]) -> Float[Array, ""]:

@@ -16,12 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.problem import ContactProblem, as_problem, check_problem, require_shape
-from jaxgran.contact.projected_methods import (
-    BarzilaiBorwein,
-    ProjectedMethod,
-    dot,
-    require_solver,
-)
+from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod, dot, require_solver
 from jaxgran.contact.solver import natural_map, solve
 from jaxgran.model.checks import as_array, require_number
 from jaxgran.model.flow import RANGES
@@ -53,9 +48,7 @@ class ContactSolution(Value):
 
 
 def solve_contacts(
-    problem: ContactProblem,
-    restitution: float | Array = 0.0,
-    solver: ProjectedMethod = _DEFAULT,
+    problem: ContactProblem, restitution: float | Array = 0.0, solver: ProjectedMethod = _DEFAULT
 ) -> ContactSolution:
     """Impulses of a frictionless contact problem: 0 ≤ J ⟂ u⁺ + α u⁻ ≥ 0 with u⁺ = u⁻ + W J.
 

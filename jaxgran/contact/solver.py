@@ -33,7 +33,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import DelassusOperator, NetworkOperator
 from jaxgran.contact.law import JAMMED_RESPONSE, relative_residual, residual_target
-from jaxgran.contact.projected_methods import Iterate, ProjectedMethod, dot
+from jaxgran.contact.projected_methods import IMPULSES, RESPONSE, Iterate, ProjectedMethod, dot
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.status import Status
 
@@ -66,10 +66,7 @@ def natural_map(
 
 @jax.custom_jvp
 def solve(
-    operator: DelassusOperator,
-    shear_rate: float | Array,
-    solver: ProjectedMethod,
-    active: Array,
+    operator: DelassusOperator, shear_rate: float | Array, solver: ProjectedMethod, active: Array
 ) -> Solution:
     """Impulses J₀ of the network at restitution zero: 0 ≤ J₀ ⟂ W J₀ + u⁻ ≥ 0.
 
@@ -96,14 +93,15 @@ def solve(
 
     def iterate(now: _Progress) -> _Progress:
         at, iterations = now.at, now.at.iterations + 1
-        origin, step = as_numbers(solver.propose(at))
-        impulses = jnp.maximum(0, origin[0] - step * (origin[1] + b) / bound)
+        start, step_length = as_numbers(solver.propose(at))
+        velocities = start[RESPONSE] + b
+        impulses = jnp.maximum(0, start[IMPULSES] - step_length * velocities / bound)
         response = operator.product(impulses)
         point = jnp.stack([impulses, response])
         residual = natural_map(w_diagonal, impulses, response + b)
         better = residual < at.best_residual
         best_residual = jnp.where(better, residual, at.best_residual)
-        memory = as_numbers(solver.learn(at, origin, point, bound, best_residual))
+        memory = as_numbers(solver.learn(at, start, point, bound, best_residual))
         new = _Progress(
             at=Iterate(point, at.point, memory, best_residual, iterations),
             residual=residual,
@@ -113,18 +111,18 @@ def solve(
         return where_active(now.unfinished, new, now)
 
     zero, infinite = jnp.zeros((2, b.size), b.dtype), jnp.asarray(jnp.inf, b.dtype)
-    start = Iterate(zero, zero, as_numbers(solver.init(b)), infinite, jnp.int32(0))
+    first = Iterate(zero, zero, as_numbers(solver.init(b)), infinite, jnp.int32(0))
     end = lax.while_loop(
         lambda now: any_replica(now.unfinished),
         iterate,
-        _Progress(start, infinite, zero, jnp.asarray(active)),
+        _Progress(first, infinite, zero, jnp.asarray(active)),
     )
     impulses, response = end.best
 
     def is_jammed():
         # The best iterate may be an early one, whose impulses have not grown yet.
-        last, moved = end.at.point
-        return dot(last, moved) < JAMMED_RESPONSE * -dot(b, last)
+        last_impulses, last_response = end.at.point
+        return dot(last_impulses, last_response) < JAMMED_RESPONSE * -dot(b, last_impulses)
 
     capped = active & ~(end.residual <= target)
     jammed = lax.cond(any_replica(capped), is_jammed, lambda: jnp.bool_(False))

@@ -8,14 +8,7 @@ from jaxtyping import Array, Int
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
 from jaxgran.dynamics.batch import checked_batch, over_replicas
-from jaxgran.dynamics.engine import (
-    Engine,
-    Jax,
-    Numba,
-    Numerics,
-    checked_numerics,
-    select_engine,
-)
+from jaxgran.dynamics.engine import Engine, Jax, Numba, Numerics, checked_numerics, select_engine
 from jaxgran.dynamics.jax_engine import events_by_jax
 from jaxgran.dynamics.observer import Observe, uses_traced_values
 from jaxgran.dynamics.tally import Tally
@@ -102,11 +95,7 @@ def require_advance(flow: ShearFlow, state: State, steps: Any) -> None:
 
 
 def advance_replica(
-    flow: ShearFlow,
-    state: State,
-    steps: Array,
-    numerics: Numerics,
-    observe: Observe | None = None,
+    flow: ShearFlow, state: State, steps: Array, numerics: Numerics, observe: Observe | None = None
 ) -> tuple[State, Tally]:
     """``advance`` for one replica, without checks."""
     engine = engine_of(flow, numerics, state, observe)

@@ -65,8 +65,13 @@ def checked_batch(
         not pass.
     """
     batch = _batch_of(flow, state, *numbers)
-    for replica in _checked_replicas(batch) if batch else [(flow, state, *numbers)]:
-        check(*replica)
+    if batch is None:
+        check(flow, state, *numbers)
+    elif is_traced(batch):
+        check(*jax.tree.map(lambda x: x[0], batch))
+    else:
+        for replica in replicas_of(batch):
+            check(*replica)
     return batch
 
 
@@ -93,13 +98,6 @@ def _batch_of(flow: Any, state: Any, *numbers: Any) -> Arguments | None:
     leaves, structure = jax.tree.flatten(state)
     states = jax.tree.unflatten(structure, map(with_axis, leaves, _DIMENSIONS))
     return jax.tree.map(with_axis, flow), states, *map(with_axis, numbers)
-
-
-def _checked_replicas(batch: Arguments) -> Iterator[Arguments]:
-    if is_traced(batch):
-        yield jax.tree.map(lambda x: x[0], batch)
-    else:
-        yield from replicas_of(batch)
 
 
 def replicas_of(batch: Any) -> Iterator[Any]:
@@ -191,11 +189,8 @@ def predicted_cost(flow: ShearFlow, timestep: Any = None) -> Any:
     networks; the second factor is their cost at dt = 1e-3. Steps without a contact are jumped over,
     so ten times as many steps cost little more than twice as much.
     """
-    numbers = (
-        flow.restitution,
-        flow.packing_fraction,
-        flow.timestep if timestep is None else timestep,
-    )
+    timestep = flow.timestep if timestep is None else timestep
+    numbers = flow.restitution, flow.packing_fraction, timestep
     alpha, nu, dt = (np.asarray(x, float) for x in numbers)
     network = 8 + 600 * (1 - alpha) * np.exp((nu - 0.8) / 0.04)
     return flow.grains * network * (1e-3 / dt) ** 0.35

@@ -45,7 +45,7 @@ def with_own_batching(function: Callable[..., T]) -> Callable[..., T]:
         @in_turn.def_vmap
         def _(size: int, is_batched: list, *arguments: Any) -> tuple[T, Any]:
             if in_lockstep():
-                axes = jax.tree.map(lambda mine: 0 if mine else None, tuple(is_batched))
+                axes = jax.tree.map(lambda batched: 0 if batched else None, tuple(is_batched))
                 result = jax.vmap(with_constants, axes)(*arguments)
             else:
                 result = _map(in_turn, arguments, is_batched)
@@ -59,14 +59,13 @@ def with_own_batching(function: Callable[..., T]) -> Callable[..., T]:
 def _map(function: Callable[..., T], arguments: tuple, is_batched: list) -> T:
     """The results of a function for one replica after another."""
     leaves, structure = jax.tree.flatten(arguments)
-    batched = jax.tree.leaves(is_batched)
+    places = [k for k, batched in enumerate(jax.tree.leaves(is_batched)) if batched]
 
-    def of_replica(own: list[jax.Array]) -> T:
-        rest = iter(own)
-        each = [next(rest) if mine else x for x, mine in zip(leaves, batched, strict=True)]
-        return function(*structure.unflatten(each))
+    def of_replica(batched_leaves: list[jax.Array]) -> T:
+        of_places = dict(zip(places, batched_leaves, strict=True))
+        return function(*structure.unflatten([of_places.get(k, x) for k, x in enumerate(leaves)]))
 
-    return lax.map(of_replica, [x for x, mine in zip(leaves, batched, strict=True) if mine])
+    return lax.map(of_replica, [leaves[k] for k in places])
 
 
 def with_forward_derivative(

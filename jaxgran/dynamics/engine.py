@@ -28,7 +28,7 @@ from jaxgran.dynamics.numba_engine.observed import advance_by_numba
 from jaxgran.dynamics.observer import Observe, uses_traced_values
 from jaxgran.dynamics.tally import Tally
 from jaxgran.environment import default_device, precision
-from jaxgran.model.checks import InputError, require_flag, require_whole, short_repr
+from jaxgran.model.checks import InputError, refused, require_flag, require_whole
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
@@ -170,7 +170,7 @@ def engine_named(name: str) -> Engine | None:
     """
     engines: dict[str, Engine | None] = {"auto": None, Jax.name: Jax(), Numba.name: Numba()}
     if str(name) not in engines:
-        raise InputError(f"engine must be {', '.join(engines)}, not {short_repr(name)}.")
+        raise refused("engine", name, f"must be {', '.join(engines)}")
     return engines[str(name)]
 
 
@@ -194,7 +194,7 @@ def checked_numerics(solver: Any, engine: Any) -> Numerics:
     """
     require_solver(solver)
     if engine is not None and not isinstance(engine, Engine):
-        raise InputError(f"engine must be jg.Jax(), jg.Numba() or None, not {short_repr(engine)}.")
+        raise refused("engine", engine, "must be jg.Jax(), jg.Numba() or None")
     return Numerics(solver, engine)
 
 

@@ -26,26 +26,14 @@ from jaxtyping import Array, Int
 
 from jaxgran.contact.near_pairs import present
 from jaxgran.contact.projected_methods import ProjectedMethod
+from jaxgran.dynamics.carry import Carry, Constants, start
 from jaxgran.dynamics.observer import Observe
-from jaxgran.dynamics.step import (
-    Carry,
-    Constants,
-    event,
-    needs_lists,
-    refresh_lists,
-    start,
-    unfinished,
-)
+from jaxgran.dynamics.step import event, needs_lists, refresh_lists, unfinished
 from jaxgran.dynamics.tally import RunningSums, Tally
 from jaxgran.dynamics.velocity_scales import readings
 from jaxgran.model.control_flow import any_replica
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.state import (
-    State,
-    kinetic_energy,
-    relative_momentum,
-    status_if_finite,
-)
+from jaxgran.model.state import State, kinetic_energy, relative_momentum, status_if_finite
 from jaxgran.model.status import Status
 
 T = TypeVar("T")
@@ -84,9 +72,9 @@ def advance_by_jax(
         )
         begin = start(constants, state)
         if events is None:
-            return _ended(constants, state, _last(constants, begin))
-        end = _after_events(constants, begin, events)
-        return _nan_where(unfinished(constants, end), _ended(constants, state, end))
+            return _result(constants, state, _all_events(constants, begin))
+        end = _fixed_number_of_events(constants, begin, events)
+        return _nan_where(unfinished(constants, end), _result(constants, state, end))
 
     return lax.scan(advance, state, steps) if jnp.ndim(steps) else advance(state, steps)
 
@@ -97,7 +85,7 @@ def _constants(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Ar
     return Constants(numbers, state.grains, state.side, steps, solver)
 
 
-def _until_stale(constants: Constants, now: Carry) -> Carry:
+def _events_of_list(constants: Constants, now: Carry) -> Carry:
     """New lists, and the events until one replica of the batch needs the next; at least one
     event.
     """
@@ -114,28 +102,30 @@ def _until_stale(constants: Constants, now: Carry) -> Carry:
     return after
 
 
-def _last(constants: Constants, begin: Carry) -> Carry:
+def _all_events(constants: Constants, begin: Carry) -> Carry:
     """The end of as many events as there are: a loop over lists round one over events."""
     return lax.while_loop(
-        lambda now: any_replica(unfinished(constants, now)), partial(_until_stale, constants), begin
+        lambda now: any_replica(unfinished(constants, now)),
+        partial(_events_of_list, constants),
+        begin,
     )
 
 
-def _next(constants: Constants, now: Carry) -> Carry:
+def _next_event(constants: Constants, now: Carry) -> Carry:
     """The next event, with new lists where they are needed."""
     stale = any_replica(needs_lists(constants, now))
     listed = lax.cond(stale, partial(refresh_lists, constants), lambda now: now, now)
     return event(constants, listed)
 
 
-def _after_events(constants: Constants, begin: Carry, events: int) -> Carry:
+def _fixed_number_of_events(constants: Constants, begin: Carry, events: int) -> Carry:
     """The end of a loop of fixed length; reverse mode keeps what is carried and computes all else
     again.
     """
 
     def visit(now: Carry, _: None) -> tuple[Carry, None]:
         active = any_replica(unfinished(constants, now))
-        return lax.cond(active, partial(_next, constants), lambda now: now, now), None
+        return lax.cond(active, partial(_next_event, constants), lambda now: now, now), None
 
     return lax.scan(jax.checkpoint(visit), begin, length=events)[0]
 
@@ -150,16 +140,16 @@ def _nan_where(invalid: Array, values: T) -> T:
     )
 
 
-def _ended(constants: Constants, state: State, end: Carry) -> tuple[State, Tally]:
+def _result(constants: Constants, state: State, end: Carry) -> tuple[State, Tally]:
     """The state and the tally at the end of an advance from a state."""
     short = jnp.where(unfinished(constants, end), Status.capacity, Status.ok).astype(jnp.int32)
     sums = end.sums._replace(status=jnp.maximum(end.sums.status, short))
-    after, tally = ended(state, *present(end.lists, state.side), end.velocities, sums)
+    after, tally = end_of_advance(state, *present(end.lists, state.side), end.velocities, sums)
     observed = None if constants.observe is None else sums.user_sums.sums
     return after, replace(tally, observed=observed)
 
 
-def ended(
+def end_of_advance(
     state: State, positions: Array, tilt: Array, velocities: Array, sums: RunningSums
 ) -> tuple[State, Tally]:
     """The state and the tally of an advance that led from a state to these positions, tilt and
@@ -187,6 +177,6 @@ def events_by_jax(
 
     def visit(at: tuple[Array, Carry]) -> tuple[Array, Carry]:
         number, now = at
-        return number + unfinished(constants, now).astype(number.dtype), _next(constants, now)
+        return number + unfinished(constants, now).astype(number.dtype), _next_event(constants, now)
 
     return lax.while_loop(keep_going, visit, (jnp.int32(0), start(constants, state)))[0]

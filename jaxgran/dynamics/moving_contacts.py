@@ -10,9 +10,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxgran.contact.delassus import grain_impulses
+from jaxgran.contact.law import SolvedContact
 from jaxgran.contact.near_pairs import Frame, PairList, PairLists
 from jaxgran.contact.network import Contacts, PairMotion, first_contact_time
-from jaxgran.dynamics.contact_sums import Impulses
 from jaxgran.model.grains import Grains
 from jaxgran.model.indexing import added_at, taken
 
@@ -40,12 +40,12 @@ def is_binary(near: PairList, contact: Array, grains: Grains) -> Bool[Array, " p
 
 
 def delayed_shift(
-    delays: Array, network: Contacts, grains: Grains, impulses: Impulses
+    delays: Array, network: Contacts, grains: Grains, contacts: SolvedContact
 ) -> Float[Array, "grains 2"]:
     """Displacements of the grains, as the impulse of each contact's own approach acts later by its
     delay.
     """
-    moving = jnp.minimum(impulses.contacts, impulses.binary)
+    moving = jnp.minimum(contacts.impulse, contacts.binary_impulse)
     delayed = moving * jnp.where(network.used, delays, 0)
     return -grain_impulses(network, delayed, grains.radii.size) / grains.masses[:, None]
 

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from jaxgran.contact.network import MOST_CONTACTS, Contacts
 from jaxgran.dynamics.snapshot import Snapshot, snapshot_of
-from jaxgran.model.checks import InputError, short_repr
+from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
@@ -96,12 +96,10 @@ def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> O
         def numbers() -> Any:
             values = observe_now(_no_contacts(slots, dtype), jnp.zeros(slots, dtype))
             if not jax.tree.leaves(values):
-                raise InputError(
-                    f"observe must return at least one number, not {short_repr(values)}."
-                )
+                raise refused("observe", values, "must return at least one number")
             for x in jax.tree.leaves(values):
                 if not isinstance(x, _NUMBERS) or jnp.asarray(x).dtype.kind not in "biuf":
-                    raise InputError(f"observe must return real numbers, not {short_repr(x)}.")
+                    raise refused("observe", x, "must return real numbers")
             return jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), dtype), values)
 
         return jax.eval_shape(numbers)
@@ -155,10 +153,10 @@ def without_contacts(observe_now: ObserveNow, dtype: jnp.dtype) -> Any:
 
 
 def _no_contacts(slots: int, dtype: jnp.dtype) -> Contacts:
-    zeros, none = jnp.zeros(slots, dtype), jnp.zeros(slots, jnp.int32)
+    zeros, grains = jnp.zeros(slots, dtype), jnp.zeros(slots, jnp.int32)
     return Contacts(
-        i=none,
-        j=none,
+        i=grains,
+        j=grains,
         normals=jnp.zeros((slots, 2), dtype),
         distances=jnp.ones(slots, dtype),
         approach=zeros,

@@ -67,9 +67,8 @@ def snapshot_of(
     flow: ShearFlow, state: State, contacts: Contacts, impulses: Array, status: Array
 ) -> Snapshot:
     """The snapshot of a flow, from its contacts and their solved impulses."""
-    timestep, shear_rate, restitution = (
-        jnp.asarray(x, state.side.dtype) for x in (flow.timestep, flow.shear_rate, flow.restitution)
-    )
+    numbers = flow.timestep, flow.shear_rate, flow.restitution
+    timestep, shear_rate, restitution = (jnp.asarray(x, state.side.dtype) for x in numbers)
     return Snapshot(state, contacts, impulses, timestep, shear_rate, restitution, status)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Int
 from jaxgran.contact.compaction import pack_bits
 from jaxgran.contact.delassus import NetworkOperator
 from jaxgran.contact.near_pairs import outer_pairs
-from jaxgran.contact.network import MOST_CONTACTS, Contacts, Touching, is_contact, pair_motion
+from jaxgran.contact.network import MOST_CONTACTS, ContactPairs, Contacts, is_contact, pair_motion
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics.advance import advance_replica
@@ -63,8 +63,8 @@ def contacts_now(flow: ShearFlow, state: State) -> tuple[Contacts, Int[Array, ""
     suffices = pairs.skin >= closing_speed_bound(flow, grains, velocities, pairs.skin) * look_ahead
     missing = ~suffices | pairs.overflow | (jnp.sum(contact, dtype=jnp.int32) > room)
     status = jnp.where(missing, Status.capacity, Status.ok).astype(jnp.int32)
-    touching = Touching(pairs.i, pairs.j, pairs.reach, motion, contact)
-    return touching.compacted(room, pack_bits(contact)).network(grains), status
+    contacts = ContactPairs(pairs.i, pairs.j, pairs.reach, motion, contact)
+    return contacts.compacted(room, pack_bits(contact)).network(grains), status
 
 
 def snapshot_series(

@@ -4,118 +4,46 @@ Its functions take what does not change (``Constants``) and what does (``Carry``
 ``Carry``:
 
 - ``refresh_lists``: new lists of near pairs.
-- ``fly``: free flight over a number of steps.
-- ``collide``: the contacts of one step change the velocities.
 - ``event``: a flight up to the step in which some pair next becomes an approaching contact, and
   the contacts of that step.
+- ``fly``: free flight over a number of steps.
+- ``collide`` of ``collisions``: the contacts of one step change the velocities.
+
+How long a near list is valid. It holds every pair whose gap was at most its skin s when it was
+built. With V a bound on how fast a gap closes (``closing_speed_bound``), which changes with every
+collision, any other pair still has a gap of more than
+
+    slack = s − Σ V t,    over the flights of duration t since the list was built.
+
+A step looks θ·dt ahead, so the list holds all of its contacts while slack ≥ V θ dt; below that it
+has expired. So a flight has at most slack/(V dt) − θ steps, and a list that does not allow for one
+step, slack < V (1 + θ) dt, is renewed before the event.
 
 In a batch, a replica that is finished or has no step to solve keeps what it has, see
 ``model.control_flow``.
 """
 
 from dataclasses import replace
-from functools import partial
-from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxgran.contact.compaction import count_bits, pack_bits
-from jaxgran.contact.delassus import NetworkOperator
 from jaxgran.contact.law import first_step, flight_of, kinetic_means
-from jaxgran.contact.near_pairs import (
-    Frame,
-    PairLists,
-    no_lists,
-    present,
-    refresh,
-    separations_now,
-)
-from jaxgran.contact.network import (
-    PairMotion,
-    Touching,
-    first_contact_time,
-    is_contact,
-    pair_motion,
-)
-from jaxgran.contact.projected_methods import ProjectedMethod
-from jaxgran.contact.solver import single_contact, solve
-from jaxgran.dynamics.contact_sums import impulses_of, sums_of_contacts
-from jaxgran.dynamics.moving_contacts import contact_delays, delayed_shift, displaced, is_binary
-from jaxgran.dynamics.observer import (
-    Observe,
-    ObserveNow,
-    middle_of_flight,
-    nothing_observed,
-    observe_at,
-    with_contacts,
-    with_flight,
-)
-from jaxgran.dynamics.tally import CONTACT, FLIGHT, LARGEST, SOLVE, RunningSums, empty_sums
+from jaxgran.contact.near_pairs import Frame, refresh, separations_now
+from jaxgran.contact.network import first_contact_time, pair_motion
+from jaxgran.dynamics.carry import Carry, Constants, observer_of, state_of
+from jaxgran.dynamics.collisions import collide
+from jaxgran.dynamics.observer import middle_of_flight, with_flight
+from jaxgran.dynamics.tally import RunningSums
 from jaxgran.dynamics.velocity_scales import READ_AFTER, readings
-from jaxgran.model.control_flow import any_replica, switch_replica, where_active
+from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
-from jaxgran.model.indexing import taken
 from jaxgran.model.reductions import largest, smallest
-from jaxgran.model.state import State, status_at_start
 from jaxgran.model.status import Status
 
 LONGEST_FLIGHT = 0.05  # strain; a bound on the change of the peculiar velocities within one flight
-_SINGLE_SLOTS = 4  # for one contact: in one slot XLA would compute the terms once for each sum
-
-
-class Constants(NamedTuple):
-    """What does not change in an advance; the last four are static."""
-
-    flow: ShearFlow
-    grains: Grains
-    side: Float[Array, ""]
-    steps: Int[Array, ""]  # to fly in all
-    solver: ProjectedMethod
-    free_flight: bool = True  # whether steps without an approaching contact are jumped over
-    # Numbers of contacts for which a solve is compiled, smallest first, beside that of all pairs;
-    # none in loops for derivatives
-    buffers: tuple[int, ...] = ()
-    moving_contacts: bool = False  # whether derivatives include that a contact moves in time
-    observe: Observe | None = None
-
-
-class Carry(NamedTuple):
-    """What an event changes."""
-
-    lists: PairLists
-    pairs: PairMotion  # of the near list
-    slack: Float[Array, ""]  # unused skin of the near list; the look-ahead of a step takes a part
-    closing_speed: Float[Array, ""]  # bound on how fast any gap closes
-    velocities: Float[Array, "grains 2"]
-    step: Int[Array, ""]  # steps flown
-    solved: Bool[Array, ""]  # whether the contacts of the present step have been dealt with
-    sums: RunningSums
-    collisions_read: Float[Array, ""]  # collisions until the last reading of the velocity scales
-
-
-def start(constants: Constants, state: State) -> Carry:
-    """The carry before the first step, without lists."""
-    lists, dtype = no_lists(state.positions, state.tilt), state.positions.dtype
-    sums = empty_sums(dtype)._replace(status=status_at_start(constants.flow, state))
-    now = Carry(
-        lists=lists,
-        pairs=PairMotion(*4 * [jnp.zeros_like(lists.near.reach)]),
-        slack=lists.near.skin,
-        closing_speed=jnp.full_like(constants.side, jnp.inf),  # so that the lists are stale
-        velocities=state.velocities,
-        step=jnp.int32(0),
-        solved=jnp.bool_(False),
-        sums=sums,
-        collisions_read=jnp.zeros_like(constants.side),
-    )
-    observe_now = observer_of(constants, now)
-    if observe_now is None:
-        return now
-    nothing = nothing_observed(observe_now, lists.near.reach.size, dtype)
-    return now._replace(sums=sums._replace(user_sums=nothing))
 
 
 def unfinished(constants: Constants, now: Carry) -> Bool[Array, ""]:
@@ -124,7 +52,7 @@ def unfinished(constants: Constants, now: Carry) -> Bool[Array, ""]:
 
 
 def needs_lists(constants: Constants, now: Carry) -> Bool[Array, ""]:
-    """Whether the near list may miss a contact of the next step, which looks θ·dt beyond itself."""
+    """Whether the near list may miss a contact of the next step."""
     flow = constants.flow
     suffices = now.slack >= now.closing_speed * (1 + flow.activation) * flow.timestep
     return unfinished(constants, now) & ~suffices
@@ -174,15 +102,15 @@ def event(constants: Constants, now: Carry) -> Carry:
     jump = _steps_to_fly(constants, now)
     after_flight = fly(constants, now, jump)
 
-    spare = after_flight.slack - now.closing_speed * flow.activation * flow.timestep
-    rounding = 16 * jnp.finfo(spare.dtype).eps * near.skin  # of the slack, summed over flights
-    expired = spare < -rounding
+    needed = now.closing_speed * flow.activation * flow.timestep
+    rounding = 16 * jnp.finfo(near.skin.dtype).eps * near.skin  # of the slack, summed over flights
+    expired = after_flight.slack - needed < -rounding
     needs_solve = active & (after_flight.step < constants.steps) & ~(expired & (jump > 0))
     collided = collide(constants, after_flight, needs_solve)
 
-    missing = near.overflow | (expired & needs_solve)
-    listed = jnp.where(missing, Status.capacity, Status.ok)
-    status = jnp.where(jnp.isfinite(now.closing_speed), listed, Status.nonfinite).astype(jnp.int32)
+    missing = near.overflow | (expired & needs_solve)  # contacts, perhaps
+    status = jnp.where(missing, Status.capacity, Status.ok)
+    status = jnp.where(jnp.isfinite(now.closing_speed), status, Status.nonfinite).astype(jnp.int32)
     sums = collided.sums._replace(status=jnp.maximum(collided.sums.status, status))
     speed = closing_speed_bound(flow, constants.grains, collided.velocities, near.skin)
     after = collided._replace(closing_speed=speed, solved=needs_solve, sums=sums)
@@ -196,14 +124,14 @@ def _steps_to_fly(constants: Constants, now: Carry) -> Int[Array, ""]:
     flow, least = constants.flow, now.solved.astype(jnp.int32)
     time, closest = first_contact_time(now.pairs, now.lists.near.reach)
     steps = jnp.maximum(first_step(time, flow.timestep, flow.activation), least.astype(time.dtype))
-    to_contact = smallest(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
+    steps_to_contact = smallest(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
     longest = jnp.divide(LONGEST_FLIGHT, flow.shear_rate) / flow.timestep
-    of_list = now.slack / now.closing_speed / flow.timestep - flow.activation
-    jump = jnp.minimum(to_contact, jnp.floor(jnp.minimum(of_list, longest)))
-    wanted = jnp.where(constants.free_flight, jump, 0)
+    steps_of_list = now.slack / now.closing_speed / flow.timestep - flow.activation
+    allowed = jnp.floor(jnp.minimum(steps_of_list, longest))
+    jump = jnp.where(constants.free_flight, jnp.minimum(steps_to_contact, allowed), 0)
     remaining = constants.steps - now.step
     return jnp.clip(
-        jnp.minimum(wanted, remaining.astype(wanted.dtype)).astype(jnp.int32), least, remaining
+        jnp.minimum(jump, remaining.astype(jump.dtype)).astype(jnp.int32), least, remaining
     )
 
 
@@ -254,134 +182,7 @@ def _with_flight(
     products = ((px, cx), (px, cy), (py, cy))
     xx, xy, yy = (jnp.dot(p, c, precision=lax.Precision.HIGHEST) for p, c in products)
     means = kinetic_means(xx, xy, yy, shear_rate * time)
-    flight = jnp.stack([time, steps.astype(time.dtype), *(time * mean for mean in means)])
-    return sums.with_sums(flight=sums.of(FLIGHT) + flight)
-
-
-class Collision(NamedTuple):
-    """What the contacts of one step do to the grains, and what they add to the sums."""
-
-    momenta: Float[Array, "grains 2"]
-    contact_sums: Float[Array, " contact"]
-    largest_overlap: Float[Array, ""]
-    iterations: Int[Array, ""]
-    residual: Float[Array, ""]
-    status: Int[Array, ""]
-    user_sums: Any
-    shift: Float[Array, "grains 2"] | None  # of ``moving_contacts``
-
-
-def collide(constants: Constants, now: Carry, needs_solve: Bool[Array, ""]) -> Carry:
-    """The contacts of one step change the velocities; not where none approaches or no step needs
-    it.
-
-    The contacts are compacted from the near list into the smallest buffer that holds them, and
-    solved and summed there; more than the largest buffer holds are solved and summed on the list.
-    """
-    near, grains, flow = now.lists.near, constants.grains, constants.flow
-    look_ahead = flow.activation * flow.timestep
-    all_contacts, approaching = is_contact(now.pairs, near.reach, look_ahead)
-    acts = needs_solve & jnp.any(pack_bits(approaching) > 0)
-    contact, motion, delays = all_contacts & acts, now.pairs, None
-    if constants.moving_contacts:
-        delays = contact_delays(now.pairs, near.reach, approaching, flow.timestep)
-        motion = now.pairs.moved(jnp.where(is_binary(near, contact, grains), delays, 0))
-    touching, words = Touching(near.i, near.j, near.reach, motion, contact), pack_bits(contact)
-
-    sizes = (1, *constants.buffers) if constants.buffers else ()
-    in_buffer = partial(_collision_in_buffer, constants, now, touching, words)
-    on_list = partial(_collision, constants, now, touching, delays)
-    programs = [*(partial(in_buffer, size) for size in sizes), on_list]
-    branch = jnp.sum(count_bits(words) > jnp.asarray([0, *sizes], jnp.int32), dtype=jnp.int32)
-    collision = switch_replica(branch, _no_collision(now, delays), programs)
-
-    kicks = collision.momenta / grains.masses[:, None]
-    x, y = kicks.T
-    ux, uy = (taken(a, near.i) - taken(a, near.j) for a in (x, y))
-    kicked = now._replace(
-        pairs=now.pairs._replace(ux=now.pairs.ux + ux, uy=now.pairs.uy + uy),
-        velocities=now.velocities + kicks,
-        sums=_with_collision(now.sums, collision, acts),
-    )
-    if collision.shift is None:
-        return kicked
-    frame, velocities, pairs = displaced(
-        collision.shift, flow.shear_rate, now.lists, kicked.velocities, kicked.pairs
-    )
-    return kicked._replace(
-        lists=replace(now.lists, frame=frame), velocities=velocities, pairs=pairs
-    )
-
-
-def _no_collision(now: Carry, delays: Array | None) -> Collision:
-    """No contact approaches."""
-    still, zero = jnp.zeros_like(now.velocities), jnp.zeros_like(now.slack)
-    no_sums, shift = jnp.zeros_like(now.sums.of(CONTACT)), None if delays is None else still
-    return Collision(
-        still, no_sums, zero, jnp.int32(0), zero, jnp.int32(0), now.sums.user_sums, shift
-    )
-
-
-def _collision_in_buffer(
-    constants: Constants, now: Carry, touching: Touching, words: Array, size: int, active: Array
-) -> Collision:
-    """What no more than ``size`` contacts do; a single one is solved in closed form."""
-    if size > 1:
-        return _collision(constants, now, touching.compacted(size, words), None, active)
-    return _collision(
-        constants, now, touching.compacted(_SINGLE_SLOTS, words), None, active, single=True
-    )
-
-
-def _collision(
-    constants: Constants,
-    now: Carry,
-    touching: Touching,
-    delays: Array | None,
-    active: Array,
-    single: bool = False,
-) -> Collision:
-    """What contacts do, from their network and its solution."""
-    flow, grains = constants.flow, constants.grains
-    network = touching.network(grains)
-    operator = NetworkOperator(network, grains.radii.size)
-    if single:
-        solution = single_contact(operator)
-    else:
-        solution = solve(operator, flow.shear_rate, constants.solver, active)
-    impulses = impulses_of(flow, network, grains, solution)
-    contact_sums, largest_overlap = sums_of_contacts(flow, touching.reach, network, impulses)
-    user_sums, observe_now = now.sums.user_sums, observer_of(constants, now)
-    if observe_now is not None:
-        user_sums = with_contacts(user_sums, observe_now, network, impulses.contacts)
-    shift = None if delays is None else delayed_shift(delays, network, grains, impulses)
-    outcome = solution.iterations, solution.residual, solution.status
-    return Collision(impulses.grains, contact_sums, largest_overlap, *outcome, user_sums, shift)
-
-
-def _with_collision(sums: RunningSums, collision: Collision, acts: Array) -> RunningSums:
-    """The sums with what the contacts of one step add."""
-    solves = acts, collision.iterations, collision.status != Status.ok
-    largest_values = jnp.stack([collision.largest_overlap, collision.residual])
-    added = sums.with_sums(
-        contact=sums.of(CONTACT) + collision.contact_sums,
-        solve=sums.of(SOLVE) + jnp.stack([x.astype(sums.numbers.dtype) for x in solves]),
-        largest=jnp.maximum(sums.of(LARGEST), largest_values),
-    )
-    status = jnp.maximum(sums.status, collision.status)
-    return added._replace(status=status, user_sums=collision.user_sums)
-
-
-def observer_of(constants: Constants, now: Carry) -> ObserveNow | None:
-    """What the user observes now, given contacts and impulses; None where nothing is observed."""
-    if constants.observe is None:
-        return None
-    return observe_at(constants.observe, constants.flow, _state_of(constants, now))
-
-
-def _state_of(constants: Constants, now: Carry) -> State:
-    positions, tilt = present(now.lists, constants.side)
-    return State(constants.grains, positions, now.velocities, constants.side, tilt)
+    return sums.added(duration=time, steps=steps, kinetic_moment=[time * mean for mean in means])
 
 
 def _with_readings(constants: Constants, now: Carry) -> Carry:
@@ -392,7 +193,7 @@ def _with_readings(constants: Constants, now: Carry) -> Carry:
     due = sums.value("collisions") - collisions_read >= READ_AFTER * constants.grains.radii.size / 2
 
     def read() -> tuple[RunningSums, Array]:
-        state = _state_of(constants, now)
+        state = state_of(constants, now)
         read_now = sums.with_reading(readings(state)), sums.value("collisions")
         return where_active(due, read_now, (sums, collisions_read))
 

@@ -3,8 +3,8 @@ follow.
 
 The fields of ``Tally`` are the table: every row has a shape, a unit, a meaning, and what adds to
 it. While the time loop runs, an engine keeps the sums as plain numbers. Their order follows from
-the table (``LAYOUT``), so no position is written down anywhere. A new sum over contacts is one row
-here and one field, with its value, of ``contact.law.ContactTerms``; both have the same order.
+the table (``LAYOUT``), so no position is written down anywhere. Where the terms of a sum are
+written follows from its kind, see `CONTRIBUTING.md`.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -32,6 +32,8 @@ AT_END = "end"  # the end of an advance
 INSTANT = "instant"
 KINDS = (FLIGHT, CONTACT, SOLVE, LARGEST, INSTANT)
 _TENSOR = (2, 2)  # symmetric; running sums hold xx, xy, yy
+Number = Float[Array, "*b"]
+Tensor = Float[Array, "*b 2 2"]
 
 
 def _sum(
@@ -51,77 +53,65 @@ class Tally(Value):
     Averages, such as the pressure, also need the cell: ``sample`` returns them, with errors.
     """
 
-    duration: Float[Array, "*b"] = _sum(FLIGHT, "1/γ̇", "time")
-    steps: Float[Array, "*b"] = _sum(
-        FLIGHT, "–", "time steps, counted as a float (they exceed an int32)"
-    )
-    impulse: Float[Array, "*b"] = _sum(CONTACT, "mσγ̇", "contact impulses J")
-    binary_impulse: Float[Array, "*b"] = _sum(
+    duration: Number = _sum(FLIGHT, "1/γ̇", "time")
+    steps: Number = _sum(FLIGHT, "–", "time steps, counted as a float (they exceed an int32)")
+    impulse: Number = _sum(CONTACT, "mσγ̇", "contact impulses J")
+    binary_impulse: Number = _sum(
         CONTACT, "mσγ̇", "(1+α) m_ij max(0, −u⁻), the impulses if every collision were binary"
     )
-    contact_moment: Float[Array, "*b 2 2"] = _sum(
+    contact_moment: Tensor = _sum(
         CONTACT, "mσ²γ̇", "d ⊗ J n over the contacts, d the centre-to-centre vector", _TENSOR
     )
-    binary_moment: Float[Array, "*b 2 2"] = _sum(
-        CONTACT, "mσ²γ̇", "the same with the binary impulses", _TENSOR
-    )
-    cluster_moment: Float[Array, "*b 2 2"] = _sum(
+    binary_moment: Tensor = _sum(CONTACT, "mσ²γ̇", "the same with the binary impulses", _TENSOR)
+    cluster_moment: Tensor = _sum(
         CONTACT,
         "mσ²γ̇",
         "the contact moment of clusters of three or more grains that push at once",
         _TENSOR,
     )
-    kinetic_moment: Float[Array, "*b 2 2"] = _sum(
+    kinetic_moment: Tensor = _sum(
         FLIGHT, "mσ²γ̇", "∫ Σ m c ⊗ c dt, exact along the flights", _TENSOR
     )
-    dissipation: Float[Array, "*b"] = _sum(
-        CONTACT, "mσ²γ̇²", "energy lost in contacts, −½ Σ J (u⁻ + u⁺)"
-    )
-    complementarity: Float[Array, "*b"] = _sum(
+    dissipation: Number = _sum(CONTACT, "mσ²γ̇²", "energy lost in contacts, −½ Σ J (u⁻ + u⁺)")
+    complementarity: Number = _sum(
         CONTACT, "mσ²γ̇²", "½ Σ J (u⁺ + α u⁻), zero where a solve is exact"
     )
-    energy_change: Float[Array, "*b"] = _sum(
-        AT_END, "mσ²γ̇²", "growth of the kinetic energy ½ Σ m c²"
-    )
-    contacts: Float[Array, "*b"] = _sum(
-        CONTACT, "–", "contacts of the steps in which a network was solved"
-    )
-    loaded_contacts: Float[Array, "*b"] = _sum(CONTACT, "–", "contacts that carry an impulse")
-    collisions: Float[Array, "*b"] = _sum(CONTACT, "–", "contacts that approach")
-    solves: Float[Array, "*b"] = _sum(SOLVE, "–", "networks solved")
-    iterations: Float[Array, "*b"] = _sum(SOLVE, "–", "solver iterations")
-    unconverged: Float[Array, "*b"] = _sum(SOLVE, "–", "solves that ended above the tolerance")
-    overlap: Float[Array, "*b"] = _sum(CONTACT, "σ", "overlaps of the contacts of solved networks")
-    deep_contacts: Float[Array, "*b"] = _sum(
+    energy_change: Number = _sum(AT_END, "mσ²γ̇²", "growth of the kinetic energy ½ Σ m c²")
+    contacts: Number = _sum(CONTACT, "–", "contacts of the steps in which a network was solved")
+    loaded_contacts: Number = _sum(CONTACT, "–", "contacts that carry an impulse")
+    collisions: Number = _sum(CONTACT, "–", "contacts that approach")
+    solves: Number = _sum(SOLVE, "–", "networks solved")
+    iterations: Number = _sum(SOLVE, "–", "solver iterations")
+    unconverged: Number = _sum(SOLVE, "–", "solves that ended above the tolerance")
+    overlap: Number = _sum(CONTACT, "σ", "overlaps of the contacts of solved networks")
+    deep_contacts: Number = _sum(
         CONTACT, "–", "contacts that overlap by more than ``DEEP_OVERLAP``"
     )
-    binary_speed_moment: Float[Array, "*b 2 2"] = _sum(
+    binary_speed_moment: Tensor = _sum(
         CONTACT,
         "mσ³γ̇²",
         "the binary moment, each contact times its speed of approach max(0, −u⁻)",
         _TENSOR,
     )
-    binary_dissipation: Float[Array, "*b"] = _sum(
+    binary_dissipation: Number = _sum(
         CONTACT,
         "mσ²γ̇²",
         "½ (1−α²) m_ij max(0, −u⁻)², the energy lost if every collision were binary",
     )
-    largest_overlap: Float[Array, "*b"] = _sum(LARGEST, "σ", "overlap of a contact")
-    worst_residual: Float[Array, "*b"] = _sum(LARGEST, "–", "relative residual of a solve")
-    local_kinetic: Float[Array, "*b"] = _sum(
+    largest_overlap: Number = _sum(LARGEST, "σ", "overlap of a contact")
+    worst_residual: Number = _sum(LARGEST, "–", "relative residual of a solve")
+    local_kinetic: Number = _sum(
         INSTANT,
         "mσ²γ̇",
         "granular temperature relative to the mean velocity of a box, times the time between "
         "readings",
     )
-    wave_kinetic: Float[Array, "*b"] = _sum(
+    wave_kinetic: Number = _sum(
         INSTANT,
         "mσ²γ̇",
         "granular temperature of the longest waves, times the time between readings",
     )
-    momentum_drift: Float[Array, "*b"] = _sum(
-        AT_END, "–", "|Σ m c| over Σ m |c|, at the end", joined="largest"
-    )
+    momentum_drift: Number = _sum(AT_END, "–", "|Σ m c| over Σ m |c|, at the end", joined="largest")
     status: Int[Array, "*b"] = _sum(AT_END, "–", "status, the worst", joined="largest")
     observed: Any = None  # sums of what a user's function observes, a pytree; None without one
 
@@ -207,8 +197,25 @@ class RunningSums(NamedTuple):
         """The sums of one kind."""
         return self.numbers[span_of(kind)]
 
-    def with_sums(self, **kinds: Float[Array, " kind"]) -> "RunningSums":
-        """The sums with those of some kinds replaced."""
+    def added(self, contact_sums: Array | None = None, **terms: Any) -> "RunningSums":
+        """The sums with terms added by name; of ``LARGEST`` the larger value is kept.
+
+        Args:
+          contact_sums: the terms of all sums of the kind ``CONTACT``, in their order.
+          terms: those of all sums of their kind; of a tensor xx, xy and yy.
+        """
+        kinds = {TABLE[name]["kind"] for name in terms}
+        changed = {} if contact_sums is None else {CONTACT: self.of(CONTACT) + contact_sums}
+        for kind in (FLIGHT, SOLVE, LARGEST):
+            if kind in kinds:
+                values = [terms[name] for name, row in TABLE.items() if row["kind"] == kind]
+                parts = jax.tree.leaves(values)
+                row = jnp.stack([jnp.asarray(x).astype(self.numbers.dtype) for x in parts])
+                sums = self.of(kind)
+                changed[kind] = jnp.maximum(sums, row) if kind == LARGEST else sums + row
+        return self._replaced(changed)
+
+    def _replaced(self, kinds: dict[str, Float[Array, " kind"]]) -> "RunningSums":
         numbers = self.numbers
         for kind, values in kinds.items():
             numbers = lax.dynamic_update_slice(numbers, values, (span_of(kind).start,))
@@ -225,7 +232,7 @@ class RunningSums(NamedTuple):
         """The sums with readings of the state now, which stand for the time since the last ones."""
         duration = self.value("duration")
         since = duration - self.value("read_until")
-        read = self.with_sums(instant=self.of(INSTANT) + since * readings)
+        read = self._replaced({INSTANT: self.of(INSTANT) + since * readings})
         return read._replace(numbers=read.numbers.at[place_of("read_until")].set(duration))
 
     def tally(self, **ends: Array) -> Tally:

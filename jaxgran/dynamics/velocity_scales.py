@@ -61,11 +61,8 @@ def wave_temperature(state: State) -> Float[Array, ""]:
     It is the mean of |Σ m c exp(ik·r)|² / Σ m over four wave vectors k and both components of c.
     Uncorrelated velocities of granular temperature T give T on average, which is equipartition.
     """
-    phases = (
-        2
-        * jnp.pi
-        * jnp.einsum("wa,ga->wg", jnp.asarray(WAVES, state.positions.dtype), _in_cell(state))
-    )
+    vectors = jnp.asarray(WAVES, state.positions.dtype)
+    phases = 2 * jnp.pi * jnp.einsum("wa,ga->wg", vectors, _in_cell(state))
     momenta = state.grains.masses[:, None] * state.velocities
     amplitudes = [jnp.einsum("wg,ga->wa", wave(phases), momenta) for wave in (jnp.cos, jnp.sin)]
     return sum(jnp.mean(part**2) for part in amplitudes) / jnp.sum(state.grains.masses)

@@ -205,9 +205,7 @@ def require_untraced(name: str, instead: str, *values: Any) -> None:
 def require_key(key: Any) -> None:
     """Raise an InputError unless this is a single JAX random key."""
     if key_shape(key) != ():
-        raise InputError(
-            f"key must be a random key such as jax.random.key(0), not {short_repr(key)}."
-        )
+        raise refused("key", key, "must be a random key such as jax.random.key(0)")
 
 
 def key_shape(key: Any) -> tuple[int, ...] | None:

@@ -61,11 +61,12 @@ def switch_replica(
     a replica does not depend on the batch.
     """
 
-    def taken(take: Callable[[jax.Array], T], mine: jax.Array, result: T) -> T:
-        return where_active(mine, take(_takes_part(mine)), result)
+    def computed(function: Callable[[jax.Array], T], chosen: jax.Array, result: T) -> T:
+        return where_active(chosen, function(_takes_part(chosen)), result)
 
     result: Any = default
-    for number, take in enumerate(branches, 1):
-        mine = branch == number
-        result = lax.cond(any_replica(mine), partial(taken, take, mine), lambda same: same, result)
+    for number, function in enumerate(branches, 1):
+        chosen = branch == number
+        compute = partial(computed, function, chosen)
+        result = lax.cond(any_replica(chosen), compute, lambda result: result, result)
     return result

@@ -15,18 +15,14 @@ from jaxgran.model.checks import (
     as_array,
     concrete_or_none,
     is_traced,
+    refused,
     require,
     require_number,
     require_whole,
     short_repr,
     two_digits,
 )
-from jaxgran.model.choices import (
-    MAX_GRAINS,
-    MAX_PACKING_FRACTION,
-    MAX_STEPS,
-    MIN_GRAINS,
-)
+from jaxgran.model.choices import MAX_GRAINS, MAX_PACKING_FRACTION, MAX_STEPS, MIN_GRAINS
 from jaxgran.model.values import Indexable
 
 _FASTEST = 1e100  # shear rate; the square and cube of it and of its inverse are finite in float64
@@ -223,7 +219,7 @@ def require_flow(flow: Any) -> None:
 def _shapes_of(flow: Any) -> set[tuple[int, ...]]:
     """The shapes of the arrays of a flow; none for a single one. InputError for anything else."""
     if not isinstance(flow, ShearFlow):
-        raise InputError(f"flow must be a ShearFlow, not {short_repr(flow)}.")
+        raise refused("flow", flow, "must be a ShearFlow")
     return {*map(np.shape, jax.tree.leaves(flow))} - {()}
 
 

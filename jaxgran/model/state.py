@@ -108,26 +108,59 @@ def require_state(flow: ShearFlow, state: State) -> None:
             f"state must be one State of {flow.grains} grains, best from prepare, not "
             f"{type(state).__name__}."
         )
-    arrays = {**vars(state.grains), **vars(state)}
-    del arrays["grains"]
+    arrays = _arrays_of(state)
     _require_arrays(flow.grains, arrays)
     known = {name: concrete_or_none(x) for name, x in arrays.items()}
     for name, numbers in known.items():
-        least, words = (0, "positive and finite") if name in _POSITIVE else (-np.inf, "finite")
-        if numbers is not None and not np.all((numbers > least) & np.isfinite(numbers)):
+        if numbers is not None and not np.all(_accepts(name, numbers, np)):
+            words = "positive and finite" if name in _POSITIVE else "finite"
             raise InputError(f"state must have only {words} {name}, best from prepare.")
     radii, positions, side, tilt = (known[x] for x in ("radii", "positions", "side", "tilt"))
     if radii is None or side is None:
         return
-    if (nu := concrete_or_none(flow.packing_fraction)) is not None:
-        of_state = float(state.packing_fraction)
-        if abs(of_state - nu) > _ROUNDING:
-            raise InputError(
-                f"packing_fraction must be {of_state:.6g}, which the state has, not {nu:g}: a flow "
-                "with another one begins with a state of its own, from prepare."
-            )
+    nu = concrete_or_none(flow.packing_fraction)
+    if nu is not None and not _has_fraction_of(flow, state):
+        raise InputError(
+            f"packing_fraction must be {float(state.packing_fraction):.6g}, which the state has, "
+            f"not {nu:g}: a flow with another one begins with a state of its own, from prepare."
+        )
     if positions is not None and tilt is not None:
         _require_apart(radii, positions, float(side), float(tilt))
+
+
+def status_at_start(flow: ShearFlow, state: State) -> Int[Array, ""]:
+    """``Status.nonfinite`` unless an engine can advance a state: it has passed ``require_state``,
+    the numbers of the flow are finite, and its time step is positive.
+
+    Traced values are known in compiled code only.
+    """
+    arrays = {name: jnp.asarray(x) for name, x in _arrays_of(state).items()}
+    return _nonfinite_unless(
+        jnp.all(x)
+        for x in (
+            *(_accepts(name, x, jnp) for name, x in arrays.items()),
+            *map(jnp.isfinite, jax.tree.leaves(flow)),
+            jnp.asarray(flow.timestep) > 0,
+            jnp.asarray(flow.shear_rate) >= 0,
+            _has_fraction_of(flow, state),
+        )
+    )
+
+
+def _arrays_of(state: State) -> dict[str, Any]:
+    arrays = {**vars(state.grains), **vars(state)}
+    del arrays["grains"]
+    return arrays
+
+
+def _accepts(name: str, numbers: Any, xp: Any) -> Any:
+    """Which numbers of an array of a state are accepted, by NumPy or ``jax.numpy``."""
+    finite = xp.isfinite(numbers)
+    return finite & (numbers > 0) if name in _POSITIVE else finite
+
+
+def _has_fraction_of(flow: ShearFlow, state: State) -> Any:
+    return abs(state.packing_fraction - flow.packing_fraction) <= _ROUNDING
 
 
 def _require_arrays(grains: int, arrays: dict[str, Any]) -> None:
@@ -159,12 +192,11 @@ def _require_apart(radii: np.ndarray, positions: np.ndarray, side: float, tilt: 
     x, y = positions[:, 0] - rows * tilt * side, positions[:, 1] - rows * side
     x = x - side * np.floor(x / side)
     reach = float(np.max(radii))  # half of the largest contact distance
-    column, row = (k.reshape(-1, 1) for k in np.meshgrid([0, -1, 1], [0, -1, 1]))
+    row, column = (k.reshape(-1, 1) for k in np.mgrid[-1:2, -1:2])
     images = np.stack([x + (column + row * (tilt - np.rint(tilt))) * side, y + row * side], axis=-1)
     images = images.reshape(-1, 2)
-    near = np.all((images >= -reach) & (images < side + reach), axis=-1)
-    numbers = np.flatnonzero(near)
-    i, j = numbers[KDTree(images[near]).query_pairs(reach, output_type="ndarray")].T
+    near = np.flatnonzero(np.all((images >= -reach) & (images < side + reach), axis=-1))
+    i, j = near[KDTree(images[near]).query_pairs(reach, output_type="ndarray")].T
     distances = np.linalg.norm(images[i] - images[j], axis=-1)
     i, j = i % len(radii), j % len(radii)
     too_near = (distances < (radii[i] + radii[j]) / 2) & (i != j)
@@ -192,25 +224,6 @@ def relative_momentum(grains: Grains, velocities: Array) -> Float[Array, ""]:
 def status_if_finite(*values: Array) -> Int[Array, ""]:
     """``Status.ok`` if all numbers are finite, or else ``Status.nonfinite``."""
     return _nonfinite_unless(jnp.all(jnp.isfinite(x)) for x in values)
-
-
-def status_at_start(flow: ShearFlow, state: State) -> Int[Array, ""]:
-    """``Status.nonfinite`` unless an engine can advance a state: numbers are finite, radii, masses,
-    the side and the time step are positive, and the packing fraction is that of the flow.
-
-    Traced values are known in compiled code only.
-    """
-    numbers = jax.tree.leaves((flow, state))
-    positive = state.grains.radii, state.grains.masses, state.side, flow.timestep
-    return _nonfinite_unless(
-        jnp.all(x)
-        for x in (
-            *map(jnp.isfinite, numbers),
-            *(jnp.asarray(x) > 0 for x in positive),
-            jnp.asarray(flow.shear_rate) >= 0,
-            abs(state.packing_fraction - flow.packing_fraction) <= _ROUNDING,
-        )
-    )
 
 
 def _nonfinite_unless(conditions: Iterable[Array]) -> Int[Array, ""]:

@@ -15,9 +15,7 @@ class Status(IntEnum):
     ok = 0
     iteration_limit = 1  # a contact solve ended above the tolerance
     imprecise = 2  # the error is larger than the requested one
-    short_sample = (
-        3  # the sample lasts only a few correlation strains, so its errors may be too small
-    )
+    short_sample = 3  # the sample lasts a few correlation strains; its errors may be too small
     not_steady = 4  # the flow was not shown to be steady
     deep_overlap = 5  # contacts overlapped by too large a part of the gap between grains
     infeasible = 6  # no impulses satisfy the contact law: the packing is jammed

@@ -76,10 +76,8 @@ class Value:
                 f"two values of {type(self).__name__} cannot be compared while JAX traces them: "
                 "compare them before or after, or their arrays by jnp.array_equal."
             )
-        (leaves, structure), (others, other_structure) = (
-            jax.tree.flatten(self),
-            jax.tree.flatten(other),
-        )
+        leaves, structure = jax.tree.flatten(self)
+        others, other_structure = jax.tree.flatten(other)
         return structure == other_structure and all(map(_equal, leaves, others))
 
     def __hash__(self) -> int:

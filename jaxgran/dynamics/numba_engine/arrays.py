@@ -66,6 +66,7 @@ class Network(NamedTuple):
     degree: Any  # (grains,), contacts of each grain
     loaded: Any  # (grains,), those with an impulse
     impulses: Any  # (grains, 2), total impulse of each grain
+    step_sums: Any  # (NUMBERS,), what the contacts add to the running sums
 
 
 class Clusters(NamedTuple):
@@ -87,13 +88,12 @@ class Clusters(NamedTuple):
 
 
 class Arrays(NamedTuple):
-    """All arrays of the time loop; ``step_sums``: (NUMBERS,), those of one step."""
+    """All arrays of the time loop."""
 
     grains: Grains
     pairs: Pairs
     network: Network
     clusters: Clusters
-    step_sums: Any
 
 
 @njit
@@ -105,7 +105,6 @@ def arrays_of(count):
         _pairs_of(count),
         network,
         _clusters_of(count, network.impulses),  # summed after the solves
-        np.empty(NUMBERS),
     )
 
 
@@ -142,6 +141,7 @@ def _network_of(count):
         degree=np.zeros(count, np.int32),
         loaded=np.zeros(count, np.int32),
         impulses=np.zeros((count, 2)),
+        step_sums=np.empty(NUMBERS),
     )
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from jaxgran.contact.projected_methods import ProjectedMethod
-from jaxgran.dynamics.jax_engine import ended
+from jaxgran.dynamics.jax_engine import end_of_advance
 from jaxgran.dynamics.numba_engine import ffi, layout
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally
 from jaxgran.model.checks import InputError
@@ -35,7 +35,9 @@ def advance_unobserved(
 
 def ended_by_numba(state: State, moved: State, row: Array) -> tuple[State, Tally]:
     """The state at the end of an advance from a state, and the tally of a row of results."""
-    return ended(state, moved.positions, row[layout.TILT], moved.velocities, sums_of_row(row))
+    return end_of_advance(
+        state, moved.positions, row[layout.TILT], moved.velocities, sums_of_row(row)
+    )
 
 
 def first_row(flow: ShearFlow, state: State) -> Array:

@@ -140,10 +140,8 @@ def _sweep(size, target, max_sweeps, clusters):
                 relaxation * (mu_nx * (jx - ix) + mu_ny * (jy - iy) - rows[c].mu_u), -impulse
             )
             rows[c].impulse = impulse + change
-            per_mass_i, per_mass_j = (
-                change * rows[c].inverse_mu_mi,
-                change * rows[c].inverse_mu_mj,
-            )
+            per_mass_i = change * rows[c].inverse_mu_mi
+            per_mass_j = change * rows[c].inverse_mu_mj
             dv[i, 0], dv[i, 1] = ix + per_mass_i * mu_nx, iy + per_mass_i * mu_ny
             dv[j, 0], dv[j, 1] = jx - per_mass_j * mu_nx, jy - per_mass_j * mu_ny
             error = change * rows[c].inverse_mu
@@ -181,11 +179,8 @@ def _descend(size, target, max_iterations, clusters):
             i, j = ends[c, FIRST], ends[c, SECOND]
             impulse, bound = rows[c].impulse, iterate[c].bound
             start = impulse + momentum * iterate[c].step
-            velocity = (
-                iterate[c].response
-                + momentum * iterate[c].response_change
-                + rows[c].mu_u * rows[c].inverse_mu
-            )
+            response = iterate[c].response + momentum * iterate[c].response_change
+            velocity = response + rows[c].mu_u * rows[c].inverse_mu
             new_impulse = max(0.0, start - stride * velocity / bound)
             descent += (start - new_impulse) * (new_impulse - impulse) * bound
             iterate[c].step = new_impulse - impulse
@@ -193,10 +188,8 @@ def _descend(size, target, max_iterations, clusters):
             dv[i, 0] = dv[i, 1] = dv[j, 0] = dv[j, 1] = 0.0
         for c in range(size):
             i, j, impulse = ends[c, FIRST], ends[c, SECOND], rows[c].impulse
-            per_mass_i, per_mass_j = (
-                impulse * rows[c].inverse_mu_mi,
-                impulse * rows[c].inverse_mu_mj,
-            )
+            per_mass_i = impulse * rows[c].inverse_mu_mi
+            per_mass_j = impulse * rows[c].inverse_mu_mj
             dv[i, 0] += per_mass_i * rows[c].mu_nx
             dv[i, 1] += per_mass_i * rows[c].mu_ny
             dv[j, 0] -= per_mass_j * rows[c].mu_nx

@@ -6,13 +6,7 @@ import numpy as np
 
 from jaxgran.dynamics.numba_engine.cluster_solver import solve_cluster
 from jaxgran.dynamics.numba_engine.compilation import LAW, njit
-from jaxgran.dynamics.numba_engine.layout import (
-    EPSILON,
-    FIRST,
-    OK,
-    SECOND,
-    STRIKES,
-)
+from jaxgran.dynamics.numba_engine.layout import EPSILON, FIRST, OK, SECOND, STRIKES
 from jaxgran.dynamics.numba_engine.network import (
     find_clusters,
     make_network,
@@ -25,7 +19,7 @@ residual_target, relative_residual = LAW["residual_target"], LAW["relative_resid
 
 
 @njit
-def collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, sums):
+def collide(contacts, t, flow, grains, pairs, network, clusters, sums):
     """Solve the contacts of a step and add them to the sums; returns the number of their grains,
     and the status.
     """
@@ -37,7 +31,7 @@ def collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, sums
     )
     residual = relative_residual(math.sqrt(squared_residual), scale, target)
     sum_impulses(contacts, touched_count, flow.one_plus_alpha, network)
-    add_contacts(sums, step_sums, contacts, flow.one_plus_alpha, grains, network)
+    add_contacts(sums, contacts, flow.one_plus_alpha, grains, network)
     add_solve(sums, iterations, residual, status, overlap)
     return touched_count, status
 

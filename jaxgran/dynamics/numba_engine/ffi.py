@@ -115,12 +115,12 @@ def compiled_handler(folder: Path) -> Any:
         config: Any = numba.config
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
         try:
-            found = compiled(cached=True)
+            callback = compiled(cached=True)
         finally:
             config.CACHE_DIR = before
-    if not found.cache_hits:
+    if not callback.cache_hits:
         keep_newest(filter(Path.is_dir, folder.parent.glob("jaxgran-*")), MOST_KEPT)
-    return found
+    return callback
 
 
 @contextmanager

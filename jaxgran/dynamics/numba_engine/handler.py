@@ -37,29 +37,9 @@ from numba import carray, njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from jaxgran.dynamics.numba_engine import layout
 from jaxgran.dynamics.numba_engine.arrays import arrays_of
-from jaxgran.dynamics.numba_engine.layout import (
-    BEGIN,
-    BLOCKS,
-    CAPACITY,
-    HANDLER,
-    INPUT_NUMBERS,
-    INPUTS,
-    MASSES,
-    NEW_POSITIONS,
-    NEW_VELOCITIES,
-    NUMBERS_GIVEN,
-    POSITIONS,
-    RADII,
-    RECORDS,
-    RESULTS,
-    SHARED_WORDS,
-    STATUS,
-    STEPS,
-    THREADS,
-    VELOCITIES,
-)
-from jaxgran.dynamics.numba_engine.loop import advance_loop
+from jaxgran.dynamics.numba_engine.loop import time_loop
 
 API_MAJOR, API_MINOR = 0, 2
 EXTENSION_START, ARGS, RETS = 1, 9, 14  # words of a call frame
@@ -92,7 +72,7 @@ def _shared_words(context):
     """Address of the shared words, which are in the module of the only function that calls this."""
 
     def generate(context, builder, signature, arguments):
-        kind = ir.ArrayType(cgutils.intp_t, SHARED_WORDS)
+        kind = ir.ArrayType(cgutils.intp_t, layout.SHARED_WORDS)
         words: Any = cgutils.add_global_variable(builder.module, kind, "jaxgran_shared_words")
         words.initializer, words.linkage = ir.Constant(kind, None), "internal"
         return builder.ptrtoint(words, cgutils.intp_t)
@@ -159,19 +139,49 @@ def _answers_metadata(frame):
 @njit
 def _start_threads(address, frame, shared):
     """The job of a call frame, and the end of its words that are threads."""
-    replicas, blocks, _ = _lengths(frame[RETS], BLOCKS)
-    results = _doubles(frame[RETS], BLOCKS, 0, (replicas * blocks, RESULTS))
+    replicas, blocks, _ = _lengths(frame[RETS], layout.BLOCKS)
+    results = _doubles(frame[RETS], layout.BLOCKS, 0, (replicas * blocks, layout.RESULTS))
     results[:] = 0.0
-    results[:, STATUS] = CAPACITY  # of replicas for which there is no memory
-    job = np.empty(_JOB_WORDS + min(shared[THREADS], replicas), np.int64)
+    results[:, layout.STATUS] = layout.CAPACITY  # of replicas for which there is no memory
+    job = np.empty(_JOB_WORDS + min(shared[layout.THREADS], replicas), np.int64)
     job[_SIZE], job[_FRAME], job[_NEXT] = _JOB, address, 0
     last = _JOB_WORDS
     while _POSIX and last + 1 < job.size:
         thread = job.ctypes.data + 8 * last
-        if _create_thread(thread, 0, shared[HANDLER], job.ctypes.data) != 0:
+        if _create_thread(thread, 0, shared[layout.HANDLER], job.ctypes.data) != 0:
             break
         last += 1
     return job, last
+
+
+@njit
+def _advance_replicas(job, frame, shared):
+    """Advance one replica after another, until all are taken."""
+    args, rets = frame[ARGS], frame[RETS]
+    replicas, blocks, _ = _lengths(rets, layout.BLOCKS)
+    _, room, record = _lengths(rets, layout.RECORDS)
+    grains = _lengths(rets, layout.NEW_POSITIONS)[1]
+    of_next = job.ctypes.data + 8 * _NEXT
+    replica = _fetch_and_increment(of_next)
+    while replica < replicas:
+        time_loop(
+            _doubles(args, layout.POSITIONS, replica, (grains, 2)),
+            _doubles(args, layout.VELOCITIES, replica, (grains, 2)),
+            _doubles(args, layout.RADII, replica, (grains,)),
+            _doubles(args, layout.MASSES, replica, (grains,)),
+            carray(
+                _data(args, layout.NUMBERS_GIVEN, replica, layout.INPUT_NUMBERS), 1, layout.INPUTS
+            )[0],
+            _doubles(args, layout.STEPS, replica, (blocks,)),
+            _doubles(args, layout.BEGIN, replica, (layout.RESULTS,)),
+            _doubles(rets, layout.NEW_POSITIONS, replica, (grains, 2)),
+            _doubles(rets, layout.NEW_VELOCITIES, replica, (grains, 2)),
+            _doubles(rets, layout.BLOCKS, replica, (blocks, layout.RESULTS)),
+            _doubles(rets, layout.RECORDS, replica, (room, record)),
+            arrays_of(grains),
+            shared,
+        )
+        replica = _fetch_and_increment(of_next)
 
 
 def handler(address):
@@ -183,37 +193,17 @@ def handler(address):
     of_shared = _shared_words()
     if address == 0:
         return of_shared
-    shared, frame = _words(of_shared, SHARED_WORDS), _words(address, RETS + 1)
+    shared, frame = _words(of_shared, layout.SHARED_WORDS), _words(address, RETS + 1)
     if frame[_SIZE] == _JOB:
         job, last = _words(address, _JOB_WORDS), _JOB_WORDS
     elif _answers_metadata(frame):
         return 0
     else:
         job, last = _start_threads(address, frame, shared)
-    frame = _words(job[_FRAME], RETS + 1)
-    args, rets = frame[ARGS], frame[RETS]
-    replicas, blocks, _ = _lengths(rets, BLOCKS)
-    _, room, record = _lengths(rets, RECORDS)
-    grains = _lengths(rets, NEW_POSITIONS)[1]
-    of_next = job.ctypes.data + 8 * _NEXT
-    replica = _fetch_and_increment(of_next)
-    while replica < replicas:
-        advance_loop(
-            _doubles(args, POSITIONS, replica, (grains, 2)),
-            _doubles(args, VELOCITIES, replica, (grains, 2)),
-            _doubles(args, RADII, replica, (grains,)),
-            _doubles(args, MASSES, replica, (grains,)),
-            carray(_data(args, NUMBERS_GIVEN, replica, INPUT_NUMBERS), 1, INPUTS)[0],
-            _doubles(args, STEPS, replica, (blocks,)),
-            _doubles(args, BEGIN, replica, (RESULTS,)),
-            _doubles(rets, NEW_POSITIONS, replica, (grains, 2)),
-            _doubles(rets, NEW_VELOCITIES, replica, (grains, 2)),
-            _doubles(rets, BLOCKS, replica, (blocks, RESULTS)),
-            _doubles(rets, RECORDS, replica, (room, record)),
-            arrays_of(grains),
-            shared,
-        )
-        replica = _fetch_and_increment(of_next)
+    try:  # noqa: SIM105, numba compiles no context manager
+        _advance_replicas(job, _words(job[_FRAME], RETS + 1), shared)
+    except Exception:  # no memory: the other threads go on, and must end before this call does
+        pass
     for n in range(_JOB_WORDS, last):
         _join_thread(job[n], 0)
     return 0

@@ -48,10 +48,8 @@ STRIKES, BEGINS, ENDS = range(3)  # rows of the calendar, in steps since the sea
 NX, NY, APPROACH, DISTANCE, IMPULSE = range(5)  # rows of the network
 # Columns of a record; behind this head its grains, then its contacts
 RECORD_STEP, RECORD_SOLVED, RECORD_CONTACTS, RECORD_TILT, RECORD_HEAD = range(5)
-# Columns of a recorded grain and of a recorded contact, and how many these are
-RECORD_X, RECORD_Y, RECORD_CX, RECORD_CY, RECORD_OF_GRAIN = range(5)
-RECORD_I, RECORD_J, RECORD_NX, RECORD_NY, RECORD_APPROACH, RECORD_DISTANCE = range(6)
-RECORD_IMPULSE, RECORD_OF_CONTACT = 6, 7
+RECORD_OF_GRAIN = 4  # numbers: x, y, c_x and c_y
+RECORD_I, RECORD_J, RECORD_OF_CONTACT = 5, 6, 7  # behind the rows of the network
 
 NEVER = np.int32(2**31 - 1)  # a step of the calendar that does not come
 MANY = 2.0**30  # steps, the end of the calendar

@@ -75,7 +75,7 @@ _NARROWEST_SKIN = 0.05  # σ, the usual skin of a dense flow
 
 
 @njit
-def advance_loop(
+def time_loop(
     positions,
     velocities,
     radii,
@@ -131,7 +131,7 @@ def advance_loop(
     steps_before_list, solved = 0, whole_part(begin[SOLVED], 1)
     collisions_read = begin[READ]  # collisions until the last reading of the velocity scales
 
-    grains, pairs, network, clusters, step_sums = arrays
+    grains, pairs, network, clusters = arrays
     put_in_order(positions, side, tilt, grains, pairs)
     largest_diameter, finite = read_state(
         positions, velocities, radii, masses, 0.0 if goes_on else shear_rate, grains
@@ -149,12 +149,8 @@ def advance_loop(
         k, new_list = 0, True  # steps since the search
         max_speed = bring_into_cell(grains, side, tilt, shear_rate)
         kinetic = kinetic_sums(grains, shear_rate)
-        # what one step may need
-        least_skin = (
-            1.2
-            * look_ahead
-            * closing_speed_bound(max_speed, shear_rate, 2 * largest_diameter, look_ahead)
-        )
+        speed = closing_speed_bound(max_speed, shear_rate, 2 * largest_diameter, look_ahead)
+        least_skin = 1.2 * look_ahead * speed  # what one step may need
         skin = min(max(least_skin, usual_skin), widest_skin)
         pair_count, skin, fits = search(grains, pairs, side, tilt, largest_diameter, skin)
         closing_speed = closing_speed_bound(
@@ -199,16 +195,7 @@ def advance_loop(
             t, block_ends = k * dt, steps_before_list + k >= block_end
             while block + 1 < blocks and steps_before_list + k >= block_end:
                 _end_block(
-                    t,
-                    tilt + shear_rate * t,
-                    side,
-                    shear_rate,
-                    kinetic,
-                    status,
-                    grains,
-                    clusters,
-                    step_sums,
-                    sums,
+                    t, tilt + shear_rate * t, flow, kinetic, status, grains, network, clusters, sums
                 )
                 block, sums, status, collisions_read = block + 1, results[block + 1], OK, 0.0
                 block_end += int(steps[block])
@@ -223,7 +210,7 @@ def advance_loop(
             overfull = contacts > network.near_pair.size
             contacts = min(contacts, network.near_pair.size)
             touched_count, outcome = collide(
-                contacts, t, flow, grains, pairs, network, clusters, step_sums, sums
+                contacts, t, flow, grains, pairs, network, clusters, sums
             )
             status = max(status, CAPACITY if overfull else OK, outcome)
             solved = 1
@@ -244,14 +231,7 @@ def advance_loop(
                 break
             if sums[COLLISIONS] - collisions_read >= READ_AFTER * count / 2:
                 read_velocity_scales(
-                    t,
-                    tilt + shear_rate * t,
-                    side,
-                    shear_rate,
-                    grains,
-                    clusters.matrices,
-                    step_sums,
-                    sums,
+                    t, tilt + shear_rate * t, flow, grains, network, clusters, sums
                 )
                 collisions_read = sums[COLLISIONS]
             if 0 < room == recorded:
@@ -289,12 +269,12 @@ def advance_loop(
 
 
 @njit
-def _end_block(t, tilt, side, shear_rate, kinetic, status, grains, clusters, step_sums, sums):
+def _end_block(t, tilt, flow, kinetic, status, grains, network, clusters, sums):
     """Complete the sums of a block that ends at the time t since the search, and is not the last
     one.
     """
-    motion, constants = grains.motion, grains.constants
-    read_velocity_scales(t, tilt, side, shear_rate, grains, clusters.matrices, step_sums, sums)
+    motion, constants, shear_rate = grains.motion, grains.constants, flow.shear_rate
+    read_velocity_scales(t, tilt, flow, grains, network, clusters, sums)
     px = py = total = 0.0
     for g in range(motion.size):
         cx, cy = motion[g].vx - shear_rate * (motion[g].y + motion[g].vy * t), motion[g].vy

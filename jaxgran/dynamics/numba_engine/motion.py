@@ -16,12 +16,9 @@ def put_in_order(positions, side, tilt, grains, pairs):
     """Write an order of the grains, row by row, that keeps neighbours close in memory if a flow
     outgrows the caches; ``pairs`` has memory for the sorting.
     """
-    in_state, cells, starts, count = grains.in_state, pairs.cells, pairs.starts, len(positions)
-    across = 1
+    count, cells, across = len(positions), pairs.cells, 1
     if count > _CACHED_GRAINS:
         across = max(1, whole_part(side / _ROW_HEIGHT, math.sqrt(count)))
-    for c in range(across * across + 1):
-        starts[c] = 0
     for g in range(count):
         cells[g] = 0
         if across > 1:
@@ -29,12 +26,27 @@ def put_in_order(positions, side, tilt, grains, pairs):
             fraction = (positions[g, 0] - tilt * positions[g, 1]) / side
             column = whole_part((fraction - np.floor(fraction)) * across, across - 1)
             cells[g] = row * across + column
+    sort_by_cell(cells, across * across, pairs.starts, grains.in_state)
+
+
+@njit
+def sort_by_cell(cells, cell_count, starts, order):
+    """Write the order of the grains by the number of their cell; those of a cell then stand at
+    ``starts[cell] : starts[cell + 1]``.
+    """
+    for cell in range(cell_count + 1):
+        starts[cell] = 0
+    for g in range(cells.size):
         starts[cells[g] + 1] += 1
-    for c in range(across * across):
-        starts[c + 1] += starts[c]
-    for g in range(count):
-        in_state[starts[cells[g]]] = g
-        starts[cells[g]] += 1
+    for cell in range(cell_count):
+        starts[cell + 1] += starts[cell]
+    # A cell is filled from its end, which moves to its beginning
+    for g in range(cells.size - 1, -1, -1):
+        starts[cells[g] + 1] -= 1
+        order[starts[cells[g] + 1]] = g
+    for cell in range(cell_count):
+        starts[cell] = starts[cell + 1]
+    starts[cell_count] = cells.size
 
 
 @njit

@@ -5,12 +5,8 @@ import math
 import numpy as np
 
 from jaxgran.dynamics.numba_engine.compilation import CELL, njit, whole_part
-from jaxgran.dynamics.numba_engine.layout import (
-    FIRST,
-    IMAGE_ROW,
-    IMAGE_X,
-    SECOND,
-)
+from jaxgran.dynamics.numba_engine.layout import FIRST, IMAGE_ROW, IMAGE_X, SECOND
+from jaxgran.dynamics.numba_engine.motion import sort_by_cell
 
 nearest_image = CELL["nearest_image"]
 
@@ -62,29 +58,16 @@ def find_near_pairs(grains, pairs, side, tilt, reach, skin, capacity):
 
 @njit
 def _sort_into_cells(grains, pairs, side, tilt, rows, columns):
-    """Sort the grains into cells row by row, those of a cell at ``starts[cell] : starts[cell +
-    1]``.
-    """
-    motion, constants = grains.motion, grains.constants
-    starts, cells, sorted_grains, places = pairs.starts, pairs.cells, pairs.sorted, pairs.places
-    for cell in range(rows * columns + 1):
-        starts[cell] = 0
+    """Sort the grains into cells row by row, and write their positions and radii in this order."""
+    motion, constants, cells, places = grains.motion, grains.constants, pairs.cells, pairs.places
     for g in range(motion.size):
         row = whole_part(motion[g].y / side * rows, rows - 1)
         fraction = (motion[g].x - tilt * motion[g].y) / side
         cells[g] = row * columns + whole_part(fraction * columns, columns - 1)
-        starts[cells[g] + 1] += 1
-    for cell in range(rows * columns):
-        starts[cell + 1] += starts[cell]
-    # A cell is filled from its end, which moves to its beginning
-    for g in range(motion.size - 1, -1, -1):
-        starts[cells[g] + 1] -= 1
-        n = starts[cells[g] + 1]
-        sorted_grains[n] = g
+    sort_by_cell(cells, rows * columns, pairs.starts, pairs.sorted)
+    for n in range(motion.size):
+        g = pairs.sorted[n]
         places[0, n], places[1, n], places[2, n] = motion[g].x, motion[g].y, constants[g].radius
-    for cell in range(rows * columns):
-        starts[cell] = starts[cell + 1]
-    starts[rows * columns] = motion.size
 
 
 @njit
@@ -120,11 +103,8 @@ def _pairs_of_cells(pairs, side, tilt, rows, columns, skin, capacity):
                 i, x, y = sorted_grains[m], places[0, m] - image_x, places[1, m] - image_y
                 radius_and_skin = places[2, m] + skin
                 for n in range(m + 1 if part == 0 else begin, end):
-                    dx, dy, reach = (
-                        x - places[0, n],
-                        y - places[1, n],
-                        radius_and_skin + places[2, n],
-                    )
+                    dx, dy = x - places[0, n], y - places[1, n]
+                    reach = radius_and_skin + places[2, n]
                     # without a branch, which would be mispredicted
                     p = np.uint64(min(count, capacity))
                     ends[FIRST, p], ends[SECOND, p] = i, sorted_grains[n]

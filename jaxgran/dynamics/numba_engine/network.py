@@ -67,13 +67,8 @@ def find_clusters(contacts, touched_count, network, clusters):
     Returns their number; the contacts of cluster m are ``source[starts[m] : starts[m + 1]]``.
     """
     ends, rows, degree, touched = network.ends, network.rows, network.degree, network.touched
-    source, starts, of_grain, offsets = (
-        clusters.source,
-        clusters.starts,
-        clusters.of_grain,
-        clusters.offsets,
-    )
-    queue, reached = clusters.queue, clusters.reached
+    source, starts, queue = clusters.source, clusters.starts, clusters.queue
+    of_grain, offsets, reached = clusters.of_grain, clusters.offsets, clusters.reached
     total = 0
     for n in range(touched_count):
         total += degree[touched[n]]

@@ -97,9 +97,9 @@ def _advance_observed(
         done = now.row[_STEPS]
         call = call_numba(flow, solver, now.state, steps[None].astype(dtype) - done, now.row, room)
         row = call.blocks[0]
-        left = replace(now.state, positions=call.positions, velocities=call.velocities)
+        moved = replace(now.state, positions=call.positions, velocities=call.velocities)
         user_sums = _with_records(flow, state, observe, now.user_sums, call, row[_STEPS] - done)
-        return _Progress(row[layout.UNFINISHED] > 0, left, row, user_sums)
+        return _Progress(row[layout.UNFINISHED] > 0, moved, row, user_sums)
 
     at_start = observe_at(observe, flow, state)
     nothing = nothing_observed(at_start, MOST_CONTACTS * flow.grains, dtype).sums
@@ -158,8 +158,8 @@ def _recorded_state(record: Array, state: State) -> State:
     tilt, count = record[layout.RECORD_TILT], state.grains.radii.size
     numbers = record[layout.RECORD_HEAD : layout.RECORD_HEAD + layout.RECORD_OF_GRAIN * count]
     motion = numbers.reshape(count, layout.RECORD_OF_GRAIN)
-    positions = wrap(motion[:, layout.RECORD_X : layout.RECORD_CX], state.side, tilt)
-    return State(state.grains, positions, motion[:, layout.RECORD_CX :], state.side, tilt)
+    positions, velocities = wrap(motion[:, :2], state.side, tilt), motion[:, 2:]
+    return State(state.grains, positions, velocities, state.side, tilt)
 
 
 def _recorded_contacts(record: Array, grains: Grains, slots: int) -> tuple[Contacts, Array]:
@@ -175,11 +175,11 @@ def _recorded_contacts(record: Array, grains: Grains, slots: int) -> tuple[Conta
     contacts = Contacts(
         i=i,
         j=j,
-        normals=rows[:, layout.RECORD_NX : layout.RECORD_APPROACH],
-        distances=jnp.where(used, rows[:, layout.RECORD_DISTANCE], 1),
-        approach=rows[:, layout.RECORD_APPROACH],
+        normals=rows[:, layout.NX : layout.APPROACH],
+        distances=jnp.where(used, rows[:, layout.DISTANCE], 1),
+        approach=rows[:, layout.APPROACH],
         inverse_mass_i=jnp.where(used, 1 / grains.masses[i], 0),
         inverse_mass_j=jnp.where(used, 1 / grains.masses[j], 0),
         used=used,
     )
-    return contacts, rows[:, layout.RECORD_IMPULSE]
+    return contacts, rows[:, layout.IMPULSE]

@@ -47,12 +47,10 @@ def add_flight(sums, steps, flight, strain, kinetic):
 
 
 @njit
-def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
-    """Add what the contacts of one step contribute, by the law of a contact; ``step_sums`` is
-    memory for it.
-    """
+def add_contacts(sums, contacts, one_plus_alpha, grains, network):
+    """Add what the contacts of one step contribute, by the law of a contact."""
     ends, rows, constants = network.ends, network.rows, grains.constants
-    impulses, loaded = network.impulses, network.loaded
+    impulses, loaded, step_sums = network.impulses, network.loaded, network.step_sums
     for n in range(_PADDED):
         step_sums[n] = 0.0
     for c in range(contacts):
@@ -64,19 +62,19 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
             impulses[i, 1] * mi - impulses[j, 1] * mj
         )
         contact = SolvedContact(
-            nx,
-            ny,
-            distance,
-            max(constants[i].radius + constants[j].radius - distance, 0.0),
-            approach,
-            change / 2,
-            one_plus_alpha,
-            impulse,
-            -one_plus_alpha * min(approach, 0.0) / (mi + mj),
-            impulse if loaded[i] > 1 or loaded[j] > 1 else 0.0,
-            1.0,
-            1.0 if impulse > 0.0 else 0.0,
-            1.0 if approach < 0.0 else 0.0,
+            nx=nx,
+            ny=ny,
+            distance=distance,
+            overlap=max(constants[i].radius + constants[j].radius - distance, 0.0),
+            approach=approach,
+            half_change=change / 2,
+            one_plus_alpha=one_plus_alpha,
+            impulse=impulse,
+            binary_impulse=-one_plus_alpha * min(approach, 0.0) / (mi + mj),
+            clustered=impulse if loaded[i] > 1 or loaded[j] > 1 else 0.0,
+            used=1.0,
+            loaded=1.0 if impulse > 0.0 else 0.0,
+            approaching=1.0 if approach < 0.0 else 0.0,
         )
         terms = contact_terms(contact)
         padded = terms[:] + terms[:_PADS]

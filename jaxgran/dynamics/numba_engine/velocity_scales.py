@@ -16,18 +16,15 @@ _AMPLITUDES = 4 * len(WAVES)  # real and imaginary parts of both components
 
 
 @njit
-def read_velocity_scales(t, tilt, side, shear_rate, grains, boxes, amplitudes, results):
+def read_velocity_scales(t, tilt, flow, grains, network, clusters, sums):
     """Add a reading of the state at the time t since the search, which stands for the time since
     the last reading.
 
-    Args:
-      t, tilt, side, shear_rate: the time, tilt and side of the cell then, and the shear shear_rate.
-      grains: the grains.
-      boxes: (grains, 3) memory for the mass and the momentum of each box.
-      amplitudes: memory for ``_AMPLITUDES`` numbers.
-      results: the running sums.
+    ``tilt`` is that of the cell then. It uses memory of the contacts, which is free between steps.
     """
     motion, constants, count = grains.motion, grains.constants, grains.motion.size
+    side, shear_rate, boxes = flow.side, flow.shear_rate, clusters.matrices
+    amplitudes = network.step_sums
     across = max(1, int(np.rint(math.sqrt(count / BOX_GRAINS))))
     tilt = remap_tilt(tilt)
     for box in range(across * across):
@@ -65,7 +62,7 @@ def read_velocity_scales(t, tilt, side, shear_rate, grains, boxes, amplitudes, r
     squares = 0.0
     for n in range(_AMPLITUDES):
         squares += amplitudes[n] * amplitudes[n]
-    since = results[_DURATION] - results[_READ_UNTIL]
-    results[_LOCAL] += since * energy / (2 * max(count - occupied, 1))
-    results[_WAVE] += since * 2 * squares / (_AMPLITUDES * total)
-    results[_READ_UNTIL] = results[_DURATION]
+    since = sums[_DURATION] - sums[_READ_UNTIL]
+    sums[_LOCAL] += since * energy / (2 * max(count - occupied, 1))
+    sums[_WAVE] += since * 2 * squares / (_AMPLITUDES * total)
+    sums[_READ_UNTIL] = sums[_DURATION]
