@@ -1,6 +1,7 @@
 """Every replica runs once, and its numbers depend on nothing but its flow and its seed."""
 
 import inspect
+import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -289,6 +290,14 @@ def test_an_interrupted_map_continues_with_more_points(tmp_path, monkeypatch) ->
     )
     with refused("has a map with restitution 0.7, .* which this one lacks"):
         ratio_map(**SETTINGS, output=output, resume=True)
+
+
+def test_what_a_cluster_is_sent_of_a_map_has_no_flows() -> None:
+    few, many = (
+        MapSettings(tuple(np.linspace(0.1, 0.9, count)), (0.5,), strain=2.0) for count in (2, 200)
+    )
+    assert pickle.loads(pickle.dumps(many)) == many
+    assert len(pickle.dumps(many)) < len(pickle.dumps(few)) + 200 * 16
 
 
 def test_ratio_map_is_the_dataset_of_the_replicas(settings, results) -> None:

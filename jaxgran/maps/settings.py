@@ -180,6 +180,10 @@ class MapSettings:
         for name in ("restitution", "packing_fraction"):
             object.__setattr__(self, name, tuple(sorted(getattr(self, name))))
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the flows, so that what a cluster is sent does not grow with the map."""
+        return {row.name: getattr(self, row.name) for row in fields(self)}
+
     @property
     def axes(self) -> dict[str, tuple[Any, ...]]:
         """Values of the four axes by name, outermost first."""
