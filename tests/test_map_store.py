@@ -123,6 +123,7 @@ def test_a_finished_map_is_extended_by_what_is_missing(name: str, output: Path) 
     assert extended.finished is None
     with refused("which this one lacks"):  # fewer points would lose some
         opened(output, replace(SETTINGS, packing_fraction=(0.6,)))
+    assert list(output.parent.iterdir()) == [output]
     fewer = opened(output, replace(SETTINGS, packing_fraction=(0.6,)), overwrite=True)
     fewer.close()
     assert len(fewer.replicas) == 4

@@ -93,7 +93,7 @@ class Store:
             there = union(in_folder.values(), from_file)
             self.replicas = {name: x for name, x in there.items() if name in self._ids}
         except BaseException:
-            self._unlock()
+            self.close()
             raise
         whole = earlier is not None and self.in_file >= self._ids
         self.finished = earlier if whole and not in_folder else None
@@ -110,6 +110,7 @@ class Store:
             self._write_begun()
             self._write([*self.replicas.values(), replica])
         self.replicas[replica.id] = replica
+        self.blocks_path([replica.id]).unlink(missing_ok=True)
 
     def blocks_path(self, replicas: Sequence[ReplicaId]) -> Path:
         """The file for the blocks of a batch, named after its replicas and all else that its
