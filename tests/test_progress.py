@@ -82,7 +82,7 @@ def test_work_before_a_replica_is_finished_counts_up_to_its_expected_cost() -> N
 def test_the_correlation_strain_that_a_map_expects_is_that_of_the_reference_map() -> None:
     data = open_map(RESULTS / "reference.nc").to_dataset()
     settings = MapSettings(**from_attrs(data))
-    flows = stack_of_any_size(list(settings.flows.values()))
+    flows = stack_of_any_size(settings.flows.values())
     count = [point.grains for point in settings.points]
     ratio = (
         expected_correlation_strain(settings, flows, count) / data.correlation_strain.values.ravel()
@@ -98,7 +98,7 @@ def test_outside_the_reference_map_the_expected_correlation_strain_is_that_of_ki
     """As the density vanishes and at α → 1 the two agree: nT/τ."""
     nearly_elastic = {"restitution": (0.98, 0.99), "packing_fraction": (0.02,), "timestep": 1e-5}
     settings, _ = chosen_settings({**MAP, **nearly_elastic})
-    flows = stack_of_any_size(list(settings.flows.values()))
+    flows = stack_of_any_size(settings.flows.values())
     theory = predicted(flows)
     number_density = 4 / np.pi * 0.02
     heating = number_density * theory.granular_temperature / theory.shear_stress

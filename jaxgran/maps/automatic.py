@@ -81,7 +81,7 @@ def plans_of_sizes(settings: MapSettings, error: float, sizes: np.ndarray) -> Pl
     so the sample is long. With many grains the preparation is long, as the correlation strain grows
     as √N. Strain and cost are right within a factor of two or three.
     """
-    flows = stack_of_any_size(list(settings.flows.values()))
+    flows = stack_of_any_size(settings.flows.values())
     correlation = expected_correlation_strain(settings, flows, sizes[:, None]).T
     alpha = np.asarray(flows.restitution)[:, None]
     target = _targets(settings, error, flows, sizes)
@@ -247,7 +247,7 @@ def _plan(settings: MapSettings, error: float) -> Plan:
     plan = cheapest(settings, error)
     if not np.isfinite(plan.seconds).all():
         worst = int(np.argmax(plan.seconds))
-        where = point_text(stack_of_any_size(list(settings.flows.values())), worst)
+        where = point_text(stack_of_any_size(settings.flows.values()), worst)
         reason = (
             f"is out of reach at {where} with up to {MAX_GRAINS} grains; take a larger one, more "
             "seeds or a shorter time step"
@@ -273,7 +273,7 @@ def _timestep_for(settings: MapSettings, error: float, strain: Any) -> tuple[flo
     """The time step of an error, and the point that needs it: one for all points, so that their
     force ratios compare.
     """
-    flows = stack_of_any_size(list(settings.flows.values()))
+    flows = stack_of_any_size(settings.flows.values())
     temperature = temperature_of(settings, flows)
     longest = automatic_timestep(temperature, flows.packing_fraction, flows.activation, error)
     steps = (

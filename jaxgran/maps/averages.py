@@ -158,7 +158,7 @@ def _is_imprecise(settings: MapSettings, large: Mapping[str, Estimate]) -> np.nd
 
 def _predicted(settings: MapSettings) -> dict[str, np.ndarray]:
     """What kinetic theory predicts; NaN where it has no steady state, as at α = 1."""
-    flows = stack_of_any_size(list(settings.flows.values()))
+    flows = stack_of_any_size(settings.flows.values())
     theory = kinetic_theory(
         flows.restitution,
         flows.packing_fraction,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -229,10 +229,11 @@ def are_numbers(values: Sequence[Any]) -> bool:
     )
 
 
-def stack_of_any_size(flows: Sequence[ShearFlow]) -> ShearFlow:
+def stack_of_any_size(flows: Iterable[ShearFlow]) -> ShearFlow:
     """The flows as one batch at their largest number of grains, for what does not depend on this
     number.
     """
+    flows = list(flows)
     largest = max(flow.grains for flow in flows)
     return stack(
         [flow if flow.grains == largest else replace(flow, grains=largest) for flow in flows]
