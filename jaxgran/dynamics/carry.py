@@ -42,7 +42,7 @@ class Carry(NamedTuple):
     step: Int[Array, ""]  # steps flown
     solved: Bool[Array, ""]  # whether the contacts of the present step have been dealt with
     sums: RunningSums
-    collisions_read: Float[Array, ""]  # collisions until the last reading of the velocity scales
+    reading_interval: Float[Array, ""]  # time between readings of the velocity scales; 0 at first
 
 
 def start(constants: Constants, state: State) -> Carry:
@@ -58,7 +58,7 @@ def start(constants: Constants, state: State) -> Carry:
         step=jnp.int32(0),
         solved=jnp.bool_(False),
         sums=sums,
-        collisions_read=jnp.zeros_like(constants.side),
+        reading_interval=jnp.zeros_like(constants.side),
     )
     observe_now = observer_of(constants, now)
     if observe_now is None:

@@ -189,13 +189,14 @@ def _with_readings(constants: Constants, now: Carry) -> Carry:
     """With readings of the velocity scales where it is time for some."""
     if not constants.buffers:  # loops for derivatives are too short for a second reading
         return now
-    sums, collisions_read = now.sums, now.collisions_read
-    due = sums.value("collisions") - collisions_read >= READ_AFTER * constants.grains.radii.size / 2
+    sums, interval, count = now.sums, now.reading_interval, constants.grains.radii.size
+    duration = sums.value("duration")
+    is_known = sums.value("collisions") >= READ_AFTER * count / 4
+    first = jnp.where(is_known, 2 * duration, 0)
+    due = (interval > 0) & (duration - sums.value("read_until") >= interval)
 
-    def read() -> tuple[RunningSums, Array]:
-        state = state_of(constants, now)
-        read_now = sums.with_reading(readings(state)), sums.value("collisions")
-        return where_active(due, read_now, (sums, collisions_read))
+    def read() -> RunningSums:
+        return where_active(due, sums.with_reading(readings(state_of(constants, now))), sums)
 
-    sums_after, read_after = lax.cond(any_replica(due), read, lambda: (sums, collisions_read))
-    return now._replace(sums=sums_after, collisions_read=read_after)
+    sums_after = lax.cond(any_replica(due), read, lambda: sums)
+    return now._replace(sums=sums_after, reading_interval=jnp.where(interval > 0, interval, first))

@@ -64,7 +64,11 @@ from jaxgran.dynamics.numba_engine.motion import (
 from jaxgran.dynamics.numba_engine.near_pairs import LIFE, closing_speed_bound, search
 from jaxgran.dynamics.numba_engine.records import record_contacts, record_flight
 from jaxgran.dynamics.numba_engine.sums import COLLISIONS, add_flight
-from jaxgran.dynamics.numba_engine.velocity_scales import read_velocity_scales
+from jaxgran.dynamics.numba_engine.velocity_scales import (
+    DURATION,
+    READ_UNTIL,
+    read_velocity_scales,
+)
 from jaxgran.dynamics.velocity_scales import READ_AFTER
 
 image_in_cell, remap_tilt = CELL["image_in_cell"], CELL["remap_tilt"]
@@ -129,7 +133,7 @@ def time_loop(
     tilt, goes_on = begin[TILT], begin[UNFINISHED] > 0.0
     # ``solved``: whether the contacts of the present step have been dealt with
     steps_before_list, solved = 0, whole_part(begin[SOLVED], 1)
-    collisions_read = begin[READ]  # collisions until the last reading of the velocity scales
+    reading_interval = begin[READ]  # time between readings of the velocity scales; 0 at first
 
     grains, pairs, network, clusters = arrays
     put_in_order(positions, side, tilt, grains, pairs)
@@ -197,7 +201,7 @@ def time_loop(
                 _end_block(
                     t, tilt + shear_rate * t, flow, kinetic, status, grains, network, clusters, sums
                 )
-                block, sums, status, collisions_read = block + 1, results[block + 1], OK, 0.0
+                block, sums, status, reading_interval = block + 1, results[block + 1], OK, 0.0
                 block_end += int(steps[block])
             if steps_before_list + k >= block_end or (k > last_k and slack < -16 * EPSILON * skin):
                 break
@@ -229,11 +233,13 @@ def time_loop(
             if not (finite and closing_speed < math.inf):
                 status = NONFINITE
                 break
-            if sums[COLLISIONS] - collisions_read >= READ_AFTER * count / 2:
+            if reading_interval == 0.0:
+                if sums[COLLISIONS] >= READ_AFTER * count / 4:
+                    reading_interval = 2 * sums[DURATION]
+            elif sums[DURATION] - sums[READ_UNTIL] >= reading_interval:
                 read_velocity_scales(
                     t, tilt + shear_rate * t, flow, grains, network, clusters, sums
                 )
-                collisions_read = sums[COLLISIONS]
             if 0 < room == recorded:
                 break
             slack -= (closing_speed - last_speed) * look_ahead
@@ -265,7 +271,7 @@ def time_loop(
         results[b, STATUS] = status
     sums = results[blocks - 1]
     sums[TILT], sums[UNFINISHED], sums[RECORDED] = tilt, unfinished, recorded
-    sums[SOLVED], sums[READ] = solved, collisions_read
+    sums[SOLVED], sums[READ] = solved, reading_interval
 
 
 @njit

@@ -10,7 +10,7 @@ from jaxgran.dynamics.velocity_scales import BOX_GRAINS, WAVES
 
 remap_tilt = CELL["remap_tilt"]
 
-_DURATION, _READ_UNTIL = place_of("duration"), place_of("read_until")
+DURATION, READ_UNTIL = place_of("duration"), place_of("read_until")
 _LOCAL, _WAVE = place_of("local_kinetic"), place_of("wave_kinetic")
 _AMPLITUDES = 4 * len(WAVES)  # real and imaginary parts of both components
 
@@ -62,7 +62,7 @@ def read_velocity_scales(t, tilt, flow, grains, network, clusters, sums):
     squares = 0.0
     for n in range(_AMPLITUDES):
         squares += amplitudes[n] * amplitudes[n]
-    since = sums[_DURATION] - sums[_READ_UNTIL]
+    since = sums[DURATION] - sums[READ_UNTIL]
     sums[_LOCAL] += since * energy / (2 * max(count - occupied, 1))
     sums[_WAVE] += since * 2 * squares / (_AMPLITUDES * total)
-    sums[_READ_UNTIL] = sums[_DURATION]
+    sums[READ_UNTIL] = sums[DURATION]
