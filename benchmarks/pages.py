@@ -16,7 +16,7 @@ import re
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import Any
 
@@ -177,16 +177,6 @@ def percent_pm(value_and_error: Iterable[float]) -> str:
     return pm(*(100 * x for x in value_and_error)) + " %"
 
 
-def product_of(
-    rows: Iterable[Mapping[str, Any]], timestep: float, flow: Sequence[float] = (0.2, 0.6)
-) -> float:
-    """Measured contact pressure over Enskog's: the product of its factors in a flow of
-    ``enskog_factors``, N = 256.
-    """
-    row = at(rows, alpha=flow[0], nu=flow[1], grains=256, timestep=timestep)
-    return math.prod(row[f"pressure_{name}"][0] for name in ASSUMPTIONS)
-
-
 def ranked(
     summary: Iterable[Mapping[str, Any]], group: str, target: float
 ) -> list[Mapping[str, Any]]:
@@ -248,7 +238,7 @@ ENVIRONMENT.globals |= {
     for function in (
         *(max, at, point, quotients, ranked, validity),
         *(sig, percent, percent_pm, pm, duration),
-        *(factors, grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where, product_of),
+        *(factors, grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where),
     )
 }
 ENVIRONMENT.globals |= {
