@@ -25,7 +25,6 @@ import jinja2
 from benchmarks import page_tables, timestep_error
 from benchmarks.output import RESULTS, ROOT
 from benchmarks.peers import front
-from benchmarks.solvers.groups import GROUPS
 from jaxgran.maps.automatic import chosen_settings
 from jaxgran.maps.results import open_map
 from jaxgran.maps.schema import flattened, shear_stress_ratio
@@ -177,16 +176,12 @@ def percent_pm(value_and_error: Iterable[float]) -> str:
     return pm(*(100 * x for x in value_and_error)) + " %"
 
 
-def ranked(
-    summary: Iterable[Mapping[str, Any]], group: str, target: float
-) -> list[Mapping[str, Any]]:
-    """The solvers that solve the median problem of a group to a target, the fastest first."""
-    rows = [
-        row
-        for row in summary
-        if row["group"] == group and row["target"] in (target, 0) and row["seconds"]
-    ]
-    return sorted(rows, key=lambda row: row["seconds"])
+def fastest_loop(rows: Iterable[Mapping[str, Any]], row: Mapping[str, Any]) -> float:
+    """Steps per second of the Gauss–Seidel loop in the flow of a row of ``device_batch``: the
+    fastest of its runs there.
+    """
+    flow = ("grains", "dt", "alpha", "nu")
+    return max(other["rival"] for other in rows if all(other[x] == row[x] for x in flow))
 
 
 def quotients(rows: Iterable[Mapping[str, float]], dividend: str, divisor: str) -> list[float]:
@@ -232,11 +227,11 @@ ENVIRONMENT.filters |= {
 }
 ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table}
 ENVIRONMENT.globals |= {"ASSUMPTIONS": ASSUMPTIONS, "timestep_verdicts": timestep_error.verdicts}
-ENVIRONMENT.globals |= {"SOLVER_GROUPS": GROUPS, "FACTOR_CURVES": CURVES, "SIZE_LAWS": SIZE_LAWS}
+ENVIRONMENT.globals |= {"FACTOR_CURVES": CURVES, "SIZE_LAWS": SIZE_LAWS}
 ENVIRONMENT.globals |= {
     function.__name__: function
     for function in (
-        *(max, at, point, quotients, ranked, validity),
+        *(max, at, fastest_loop, point, quotients, validity),
         *(sig, percent, percent_pm, pm, duration),
         *(factors, grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where),
     )

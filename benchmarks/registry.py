@@ -155,20 +155,11 @@ BENCHMARKS = (
         module="peers.compare",
     ),
     Benchmark(
-        "collection",
-        "Which contact problems is a solver compared on, and what are their solutions?",
-        (4, 0.5),
-        ("collection.h5", "collection.json"),
-        one_core=True,
-        module="collection.make",
-    ),
-    Benchmark(
         "solvers",
-        "Which contact solver is best where, this program's or one of another package?",
-        (8.5, 2),
+        "How many iterations and how much time does a contact solve take, by which method?",
+        (2, 1),
         ("solvers.json",),
         one_core=True,
-        module="solvers.run",
     ),
     Benchmark(
         "startup",

@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from exact_contacts import certified_impulses
 from flows import EXACT, GRAINS, flow_of
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from oracles import nearest_image
 
 import jaxgran as jg
-from benchmarks.exact_contacts import certified_impulses
 from benchmarks.independent import contact_dynamics, event_driven
 from jaxgran.model.cell import displacement
 from jaxgran.model.grains import Grains
