@@ -157,7 +157,7 @@ BENCHMARKS = (
     Benchmark(
         "solvers",
         "How many iterations and how much time does a contact solve take, by which method?",
-        (2, 1),
+        (1, 0.5),
         ("solvers.json",),
         one_core=True,
     ),

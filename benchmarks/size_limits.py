@@ -27,7 +27,6 @@ from scipy.optimize import least_squares, minimize_scalar
 from scipy.stats import chi2
 
 import jaxgran as jg
-from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
 from benchmarks.reference_map import PLANE
 from jaxgran.maps.variables import NOT_RUN
@@ -107,9 +106,12 @@ def flows_of(rows: list[dict[str, Any]], average: str, least_sizes: int = 3) -> 
 
 def fitted(flow: Flow, shape: np.ndarray) -> tuple[float, float, float, float]:
     """x∞ and amplitude of x∞ − c × shape, the standard error of x∞, and χ²."""
-    design = np.stack([np.ones(len(shape)), -shape], axis=1)
-    constants, covariance, chi_squared = weighted_fit(design, flow.values, flow.stderrs)
-    return constants[0], constants[1], np.sqrt(covariance[0, 0]), chi_squared
+    design = np.stack([np.ones(len(shape)), -shape], axis=1) / flow.stderrs[:, None]
+    values = flow.values / flow.stderrs
+    (limit, amplitude), *_ = np.linalg.lstsq(design, values, rcond=None)
+    covariance = np.linalg.inv(design.T @ design)
+    chi_squared = np.sum((values - design @ [limit, amplitude]) ** 2)
+    return limit, amplitude, np.sqrt(covariance[0, 0]), chi_squared
 
 
 def exponents(flows: list[Flow]) -> dict[str, Any]:

@@ -5,8 +5,8 @@ in which most grains approach. Compiled for one shape, and run by JAX on one cor
 one product with W. The error of the stress of a solve, Σ J n⊗n over that of a solve to 1e-12, is
 given over its tolerance.
 
-    python -m benchmarks solvers          # two minutes
-    python -m benchmarks solvers --quick  # two flows, under a minute
+    python -m benchmarks solvers          # a minute
+    python -m benchmarks solvers --quick  # two flows, half a minute
 """
 
 from functools import partial
