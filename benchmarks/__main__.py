@@ -140,13 +140,9 @@ def parser() -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         for option in benchmark.options:
-            if option.kind is bool:
-                subparser.add_argument(option.name, action="store_true", help=option.help)
-            else:
-                place = {} if option.name.startswith("-") else {"nargs": "?"}
-                subparser.add_argument(
-                    option.name, type=option.kind, choices=option.choices, help=option.help, **place
-                )
+            subparser.add_argument(
+                option.name, type=option.kind, choices=option.choices, help=option.help
+            )
     return main_parser
 
 

@@ -9,11 +9,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from benchmarks import (
-    collapse,
-    contact_duration,
     dissipation,
-    enskog_factors,
-    gradients,
     paper,
     reference_figure,
     scaling,
@@ -30,20 +26,12 @@ from jaxgran.reference.table import shipped_table
 from jaxgran.theory.corrected_shear import MEASURED_LAWS
 
 PICTURES: dict[str, Callable[[], Figure]] = {
-    "collapse": lambda: collapse.draw(read("collapse")["rows"]),
-    "contact_duration": lambda: contact_duration.draw(
-        read("contact_duration")["event_driven"], read("contact_duration")["jaxgran"]
-    ),
     "dissipation": lambda: dissipation.draw(
         *(dissipation.of_rows(read("dissipation")[name]) for name in ("points", "judged_points")),
         MEASURED_LAWS,
     ),
     "size_study": lambda: size_figures.draw_sizes(read("size_study")["flows"]),
     "size_study_waves": lambda: size_figures.draw_waves(read("size_study")["flows"]),
-    "enskog_factors": lambda: enskog_factors.draw(
-        enskog_factors.FULL, read("enskog_factors")["rows"]
-    ),
-    "gradients": lambda: gradients.draw(read("gradients")["flows"]),
     "reference": lambda: reference_figure.draw(shipped_table()),
     "scaling": lambda: scaling.draw(read("scaling"), read("scaling")["exponents"]),
     "speed_vs_accuracy": lambda: chart.draw(read("speed_vs_accuracy")),

@@ -16,7 +16,7 @@ import re
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import Any
 
@@ -25,7 +25,6 @@ import jinja2
 from benchmarks import page_tables, timestep_error
 from benchmarks.output import RESULTS, ROOT
 from benchmarks.peers import front
-from benchmarks.solvers.groups import GROUPS
 from jaxgran.maps.automatic import chosen_settings
 from jaxgran.maps.results import open_map
 from jaxgran.maps.schema import flattened, shear_stress_ratio
@@ -177,26 +176,12 @@ def percent_pm(value_and_error: Iterable[float]) -> str:
     return pm(*(100 * x for x in value_and_error)) + " %"
 
 
-def product_of(
-    rows: Iterable[Mapping[str, Any]], timestep: float, flow: Sequence[float] = (0.2, 0.6)
-) -> float:
-    """Measured contact pressure over Enskog's: the product of its factors in a flow of
-    ``enskog_factors``, N = 256.
+def fastest_loop(rows: Iterable[Mapping[str, Any]], row: Mapping[str, Any]) -> float:
+    """Steps per second of the Gauss–Seidel loop in the flow of a row of ``device_batch``: the
+    fastest of its runs there.
     """
-    row = at(rows, alpha=flow[0], nu=flow[1], grains=256, timestep=timestep)
-    return math.prod(row[f"pressure_{name}"][0] for name in ASSUMPTIONS)
-
-
-def ranked(
-    summary: Iterable[Mapping[str, Any]], group: str, target: float
-) -> list[Mapping[str, Any]]:
-    """The solvers that solve the median problem of a group to a target, the fastest first."""
-    rows = [
-        row
-        for row in summary
-        if row["group"] == group and row["target"] in (target, 0) and row["seconds"]
-    ]
-    return sorted(rows, key=lambda row: row["seconds"])
+    flow = ("grains", "dt", "alpha", "nu")
+    return max(other["rival"] for other in rows if all(other[x] == row[x] for x in flow))
 
 
 def quotients(rows: Iterable[Mapping[str, float]], dividend: str, divisor: str) -> list[float]:
@@ -242,13 +227,13 @@ ENVIRONMENT.filters |= {
 }
 ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table}
 ENVIRONMENT.globals |= {"ASSUMPTIONS": ASSUMPTIONS, "timestep_verdicts": timestep_error.verdicts}
-ENVIRONMENT.globals |= {"SOLVER_GROUPS": GROUPS, "FACTOR_CURVES": CURVES, "SIZE_LAWS": SIZE_LAWS}
+ENVIRONMENT.globals |= {"FACTOR_CURVES": CURVES, "SIZE_LAWS": SIZE_LAWS}
 ENVIRONMENT.globals |= {
     function.__name__: function
     for function in (
-        *(max, at, point, quotients, ranked, validity),
+        *(max, at, fastest_loop, point, quotients, validity),
         *(sig, percent, percent_pm, pm, duration),
-        *(factors, grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where, product_of),
+        *(factors, grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where),
     )
 }
 ENVIRONMENT.globals |= {

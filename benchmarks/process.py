@@ -1,9 +1,6 @@
-"""The process that a benchmark runs in: settings of JAX, which it reads when it starts, and other
-processes.
-"""
+"""The process that a benchmark runs in: settings of JAX, which it reads when it starts."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -21,9 +18,3 @@ def set_up(one_core: bool) -> None:
     if one_core:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {ONE_CORE}".strip()
         os.environ["OMP_NUM_THREADS"] = "1"
-
-
-def printed_by(name: str, *options: str) -> str:
-    """What a benchmark prints in a process of its own, with options that make it write nothing."""
-    command = [sys.executable, "-m", "benchmarks", name, *options]
-    return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, cwd=ROOT).stdout

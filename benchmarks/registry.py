@@ -10,8 +10,6 @@ from pathlib import Path
 class Option:
     """An option of one benchmark, given to its ``run`` under the same name; without it the default
     there holds.
-
-    A name without dashes is a file, which may be left out. The kind ``bool`` is a flag.
     """
 
     name: str
@@ -50,18 +48,6 @@ BENCHMARKS = (
         ("validation.json", "validation.png"),
     ),
     Benchmark(
-        "elastic_limit",
-        "Is kinetic theory right in loose, nearly elastic flow, and at which number of grains?",
-        (15, 0.5),
-        ("elastic_limit.json",),
-    ),
-    Benchmark(
-        "enskog_factors",
-        "Which assumption of kinetic theory fails, and what of it survives dt → 0 and N → ∞?",
-        (3, 0.5),
-        ("enskog_factors.json", "enskog_factors.png"),
-    ),
-    Benchmark(
         "paper",
         "Where in the plane are binary collisions all there is?",
         (20, 0.5),
@@ -71,13 +57,6 @@ BENCHMARKS = (
             "paper_mean_mass.json",
         ),
         (Option("--mean-mass", "compare with the ratio by the paper's mass", bool),),
-    ),
-    Benchmark(
-        "paper_claims",
-        "Do the flows have the properties that the paper names, and what error has an average over "
-        "2000 time steps?",
-        (6, 0.5),
-        ("paper_claims.json",),
     ),
     Benchmark(
         "reference_map",
@@ -140,19 +119,6 @@ BENCHMARKS = (
         ("flow.json", "flow.png", "flow.gif"),
     ),
     Benchmark(
-        "collapse",
-        "What does a time step do to an inelastic collapse of three and four discs?",
-        (1, 0.4),
-        ("collapse.json", "collapse.png"),
-        one_core=True,
-    ),
-    Benchmark(
-        "contact_duration",
-        "Is a time step a duration of contact of event-driven discs?",
-        (2, 1),
-        ("contact_duration.json", "contact_duration.png"),
-    ),
-    Benchmark(
         "step_cost",
         "How long does a step of a replica take, beside a numba loop made for one purpose?",
         (1, 0.5),
@@ -190,20 +156,11 @@ BENCHMARKS = (
         module="peers.compare",
     ),
     Benchmark(
-        "collection",
-        "Which contact problems is a solver compared on, and what are their solutions?",
-        (4, 0.5),
-        ("collection.h5", "collection.json"),
-        one_core=True,
-        module="collection.make",
-    ),
-    Benchmark(
         "solvers",
-        "Which contact solver is best where, this program's or one of another package?",
-        (8.5, 2),
+        "How many iterations and how much time does a contact solve take, by which method?",
+        (1, 0.5),
         ("solvers.json",),
         one_core=True,
-        module="solvers.run",
     ),
     Benchmark(
         "startup",
@@ -239,30 +196,10 @@ BENCHMARKS = (
         ("size_limits.json",),
     ),
     Benchmark(
-        "coverage",
-        "How often do 95 % intervals hold, against the sampled strain and the number of seeds?",
-        (6, 0.5),
-        ("coverage.json", "coverage_error.json", "coverage_short.json"),
-        options=(
-            Option(
-                "--error", "judge samples that end at this error, into coverage_error.json", float
-            ),
-            Option("--short", "judge samples of a strain of 2 to 50, of 64 grains", bool),
-        ),
-        one_core=True,
-    ),
-    Benchmark(
         "stability",
         "Where do methods fail, from loose and elastic to dense and dissipative flows?",
         (30, 2),
         ("stability.json", "stability.png"),
-        one_core=True,
-    ),
-    Benchmark(
-        "gradients",
-        "What do derivatives of a flow cost, and how fast do they grow with strain?",
-        (5, 1),
-        ("gradients.json", "gradients.png"),
         one_core=True,
     ),
 )

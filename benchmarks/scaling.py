@@ -12,6 +12,8 @@ least-squares fit to the logarithms.
 
 import json
 import resource
+import subprocess
+import sys
 import time
 from dataclasses import replace
 
@@ -22,7 +24,7 @@ from matplotlib.figure import Figure
 
 import jaxgran as jg
 from benchmarks.output import Output
-from benchmarks.process import printed_by
+from benchmarks.process import ROOT
 from jaxgran.plotting.style import TWO_COLUMNS, styled
 
 GRAINS, QUICK_GRAINS = (128, 512, 2_000, 10_000, 30_000, 100_000, 1_000_000), (1_000, 10_000)
@@ -64,7 +66,8 @@ def run(output: Output, grains: int | None = None) -> None:
 
 
 def in_own_process(grains: int) -> dict[str, float]:
-    text = printed_by("scaling", "--grains", str(grains))
+    command = [sys.executable, "-m", "benchmarks", "scaling", "--grains", str(grains)]
+    text = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, cwd=ROOT).stdout
     print(f"{grains} grains: {text.strip()}", flush=True)
     return json.loads(text)
 

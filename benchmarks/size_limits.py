@@ -27,7 +27,6 @@ from scipy.optimize import least_squares, minimize_scalar
 from scipy.stats import chi2
 
 import jaxgran as jg
-from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
 from benchmarks.reference_map import PLANE
 from jaxgran.maps.variables import NOT_RUN
@@ -72,13 +71,10 @@ def run(output: Output) -> None:
         laws[average] = {"exponents": shared, "law": law}
         limits += [{"average": average, **limit} for limit in limits_of(loose, shared["interval"])]
         print(average, rounded(laws[average], 4))
-    unfitted = {
-        "checks": list(compared(*(jg.open_map(RESULTS / name).to_dataset() for name in CHECK))),
-        "nearly_elastic": list(nearly_elastic(laws["pressure"]["law"]["constants"])),
-    }
-    for row in (row for rows in unfitted.values() for row in rows):
+    checks = list(compared(*(jg.open_map(RESULTS / name).to_dataset() for name in CHECK)))
+    for row in checks:
         print(rounded(row, 4))
-    head = {"laws": rounded(laws, 5), **rounded(unfitted, 4)}
+    head = {"laws": rounded(laws, 5), "checks": rounded(checks, 4)}
     output.write_rows("size_limits", head, "rows", rounded(limits, 5))
 
 
@@ -110,9 +106,12 @@ def flows_of(rows: list[dict[str, Any]], average: str, least_sizes: int = 3) -> 
 
 def fitted(flow: Flow, shape: np.ndarray) -> tuple[float, float, float, float]:
     """x∞ and amplitude of x∞ − c × shape, the standard error of x∞, and χ²."""
-    design = np.stack([np.ones(len(shape)), -shape], axis=1)
-    constants, covariance, chi_squared = weighted_fit(design, flow.values, flow.stderrs)
-    return constants[0], constants[1], np.sqrt(covariance[0, 0]), chi_squared
+    design = np.stack([np.ones(len(shape)), -shape], axis=1) / flow.stderrs[:, None]
+    values = flow.values / flow.stderrs
+    (limit, amplitude), *_ = np.linalg.lstsq(design, values, rcond=None)
+    covariance = np.linalg.inv(design.T @ design)
+    chi_squared = np.sum((values - design @ [limit, amplitude]) ** 2)
+    return limit, amplitude, np.sqrt(covariance[0, 0]), chi_squared
 
 
 def exponents(flows: list[Flow]) -> dict[str, Any]:
@@ -161,32 +160,6 @@ def limits_of(flows: list[Flow], interval: list[float]) -> list[dict[str, Any]]:
             }
         )
     return limits
-
-
-def excess(value: float, error: float, other: float, other_error: float) -> list[float]:
-    """A value over another, less one, and its standard error."""
-    ratio = value / other
-    return [ratio - 1, ratio * np.hypot(error / value, other_error / other)]
-
-
-def nearly_elastic(constants: Sequence[float]) -> Iterator[dict[str, Any]]:
-    """The pressure of the fewest grains over that of the most, measured and by the law, in the
-    flows of ``elastic_limit``, to which it was not fitted.
-    """
-    rows = [
-        {"source": "elastic", "restitution": row["alpha"], "packing_fraction": row["nu"]}
-        | {"grains": row["grains"], "pressure": [1 + row["pressure"][0], row["pressure"][1]]}
-        for row in json.loads((RESULTS / "elastic_limit.json").read_text())["rows"]
-    ]
-    for flow in flows_of(rows, "pressure"):
-        present = 1 - missing_part(constants, flow)
-        yield {
-            "restitution": flow.restitution,
-            "packing_fraction": flow.packing_fraction,
-            "grains": [int(n) for n in flow.grains[[0, -1]]],
-            "measured": excess(*(x[k] for k in (0, -1) for x in (flow.values, flow.stderrs))),
-            "by_law": present[0] / present[-1] - 1,
-        }
 
 
 def compared(small: xr.Dataset, large: xr.Dataset) -> Iterator[dict[str, Any]]:

@@ -15,21 +15,17 @@ from concurrent.futures import ProcessPoolExecutor
 from itertools import product
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 import jaxgran as jg
 from benchmarks.output import Output
+from benchmarks.timestep_study import START, samples_by_timestep
 from jaxgran.environment import usable_cores
 from jaxgran.sampling.sample import estimates
 from jaxgran.sampling.timestep import DEEPEST_OVERLAP, mean_gap, stress_error
 
-START = 1e-3  # time step of the steady state
 RELAXATION = 2.0  # strain at a new time step before its sample
 ALLOWED = 0.03  # relative error of the pressure that has to be foretold
-
-advance = jax.jit(jg.advance)
 
 
 class Plan(NamedTuple):
@@ -112,18 +108,8 @@ def verdicts(rows: Sequence[Mapping]) -> dict:
 def samples(plan: Plan, task: tuple[float, float, int]) -> dict[float, jg.Sample]:
     """A sample of every time step of one seed of a flow."""
     nu, alpha, seed = task
-
-    def flow(timestep: float) -> jg.ShearFlow:
-        return jg.ShearFlow(plan.grains, alpha, nu, timestep)
-
-    steady = state = jg.prepare(flow(START), jax.random.key(seed))
-    sampled = {}
-    for timestep in sorted(plan.timesteps, reverse=True):
-        before = steady if timestep >= START else state
-        relaxed, _ = advance(flow(timestep), before, jnp.int32(round(RELAXATION / timestep)))
-        state, sample = jg.sample(flow(timestep), relaxed, plan.strain)
-        sampled[timestep] = jax.tree.map(np.asarray, sample)
-    return sampled
+    flow = jg.ShearFlow(plan.grains, alpha, nu, START)
+    return samples_by_timestep(flow, seed, plan.timesteps, RELAXATION, plan.strain)
 
 
 def rows_of_flow(

@@ -16,7 +16,9 @@ freedom (at least one), joined over fits that take in one time step less and one
 
 import multiprocessing
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
 
@@ -104,17 +106,23 @@ def run(output: Output) -> None:
 def samples(plan: Plan, task: tuple[float, float, str, int]) -> dict[float, jg.Sample]:
     """One seed of one flow under one rule: a sample of every time step."""
     nu, alpha, rule, seed = task
-
-    def flow(timestep: float) -> jg.ShearFlow:
-        return jg.ShearFlow(plan.grains, alpha, nu, timestep, activation=rule)
-
+    flow = jg.ShearFlow(plan.grains, alpha, nu, START, activation=rule)
     strain = plan.strain[plan.packing_fraction.index(nu)]
-    steady = jg.prepare(flow(START), jax.random.key(seed))
-    sampled, state = {}, steady
-    for timestep in sorted(plan.timesteps, reverse=True):
-        before = steady if timestep >= START else state
-        relaxed, _ = advance(flow(timestep), before, jnp.int32(round(RELAXATION / timestep)))
-        state, sample = jg.sample(flow(timestep), relaxed, strain)
+    return samples_by_timestep(flow, seed, plan.timesteps, RELAXATION, strain)
+
+
+def samples_by_timestep(
+    flow: jg.ShearFlow, seed: int, timesteps: Sequence[float], relaxation: float, strain: float
+) -> dict[float, jg.Sample]:
+    """A sample of every time step, the finer ones in turn, each after a strain of relaxation. A
+    flow has the time step of its steady state.
+    """
+    steady = state = jg.prepare(flow, jax.random.key(seed))
+    sampled = {}
+    for timestep in sorted(timesteps, reverse=True):
+        before = steady if timestep >= flow.timestep else state
+        stepped, steps = replace(flow, timestep=timestep), jnp.int32(round(relaxation / timestep))
+        state, sample = jg.sample(stepped, advance(stepped, before, steps)[0], strain)
         sampled[timestep] = jax.tree.map(np.asarray, sample)
     return sampled
 

@@ -54,8 +54,6 @@ def standard_errors(
     Blocks of shorter seeds are merged until they last about as long as those of the longest, so
     that one correlation time holds for all, see ``merged_blocks``.
 
-    How often intervals for sheared flows hold is measured by ``python -m benchmarks coverage``.
-
     Args:
       estimate: maps a pytree of sums with any leading axes to estimates by name with the same
         leading axes.

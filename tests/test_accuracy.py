@@ -133,7 +133,7 @@ def test_averages_of_the_engine_jax_are_those_of_event_driven_discs() -> None:
 
 
 def test_the_force_ratio_of_a_dense_flow_is_that_of_64_replicas() -> None:
-    """1.3343 ± 0.0020 over a strain of 3200: ``python -m benchmarks coverage --short``."""
+    """1.3343 ± 0.0020 over a strain of 50 each."""
     sample = sampled(400.0, restitution=0.3, packing_fraction=0.7)
     assert_agree(sample, {"force_ratio": (1.3343, 0.002)})
     assert sample.errors()["force_ratio"] < 0.02

@@ -9,11 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from contact_networks import MAX_DISCS, padded_network, random_network
+from exact_contacts import delassus
 from flows import EXACT, GRAINS, of_state
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 from jax import lax
-from oracles import MAX_DISCS, build, delassus, padded_network, random_network
+from oracles import build
 
 from jaxgran.contact.delassus import NetworkOperator, grain_impulses
 from jaxgran.contact.near_pairs import Frame, present, separations_now

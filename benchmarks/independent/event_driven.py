@@ -23,8 +23,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-import jaxgran as jg
-
 MOST_SKIN, NARROW_SKIN = (
     1.0,
     0.2,
@@ -43,10 +41,8 @@ SUMS = (
     "contact_yy",
     "dissipation",
     "collisions",
-    "elastic",  # collisions within t_c of an earlier one
-    "elastic_trace",  # their part of contact_xx + contact_yy
 )
-DURATION, KINETIC, CONTACT, DISSIPATION, COLLISIONS, ELASTIC, ELASTIC_TRACE = 0, 1, 4, 7, 8, 9, 10
+DURATION, KINETIC, CONTACT, DISSIPATION, COLLISIONS = 0, 1, 4, 7, 8
 
 
 class Discs(NamedTuple):
@@ -98,16 +94,6 @@ class _Near(NamedTuple):
     shifts: np.ndarray
 
 
-def discs_of(state: jg.State) -> Discs:
-    """The discs of a state of jaxgran; none of them has collided before."""
-    radii, masses, positions, velocities = (
-        np.array(x, float)
-        for x in (state.grains.radii, state.grains.masses, state.positions, state.velocities)
-    )
-    never = np.full(len(radii), -np.inf)
-    return Discs(radii, masses, positions, velocities, never, float(state.side), float(state.tilt))
-
-
 def sheared(
     discs: Discs,
     law: Law,
@@ -145,11 +131,8 @@ def sheared(
 
 
 def averages(sums: dict[str, np.ndarray], discs: Discs) -> dict[str, np.ndarray]:
-    """Temperature, total pressure and shear stress, collisions per disc and time, and shares of
-    elastic collisions.
-
-    Sums have any leading axes. The shares are those of the number of collisions and of the contact
-    pressure.
+    """Temperature, total pressure and shear stress, and collisions per disc and time. Sums have any
+    leading axes.
     """
     volume, count = discs.side**2 * sums["duration"], len(discs.radii)
     contact, kinetic = (sums[f"{name}_xx"] + sums[f"{name}_yy"] for name in ("contact", "kinetic"))
@@ -158,8 +141,6 @@ def averages(sums: dict[str, np.ndarray], discs: Discs) -> dict[str, np.ndarray]
         "pressure": (contact + kinetic) / (2 * volume),
         "shear_stress": -(sums["contact_xy"] + sums["kinetic_xy"]) / volume,
         "collision_rate": 2 * sums["collisions"] / (count * sums["duration"]),
-        "elastic_share": sums["elastic"] / sums["collisions"],
-        "elastic_pressure_share": sums["elastic_trace"] / contact,
     }
 
 
@@ -265,9 +246,6 @@ def _collide(discs, law, near, life, limit, most, sums):
             (1 - one_plus_alpha * one_plus_alpha) / 2 * reduced * approach * approach
         )
         sums[COLLISIONS] += 1
-        if soft:
-            sums[ELASTIC] += 1
-            sums[ELASTIC_TRACE] += impulse * distance
         too_fast = False
         for disc, push in ((i, impulse), (j, -impulse)):
             _add_kinetic(

@@ -29,7 +29,8 @@ from jax.typing import ArrayLike
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.sampling.timestep import distance_to_jamming, stress_error
 
-# relative error of the stress of one solve over its residual, that 98 % of solves do not exceed
+# relative error of the stress of one solve over its residual, which none of ``benchmarks solvers``
+# exceeds
 RESIDUAL_FACTOR = 34
 MEASURED_POLYDISPERSITY = 0.26  # of the flows that all laws here are measured with
 MEASURED_RANGES = {

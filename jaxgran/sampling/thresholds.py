@@ -49,15 +49,14 @@ DRIFT_BLOCKS = 16  # of a sample in this test
 # test, however short the correlation strain is.
 CLUSTER_STRAIN = 1.0
 
-# Length of a sample: coverage of 95 % intervals, mean and worst over average, seeds and 12 flows
-# (``python -m benchmarks coverage``)
+# Length of a sample: coverage of 95 % intervals, mean and worst over average, seeds and 12 flows of
+# 256 grains, 64 repeats of each
 
 FEWEST_CORRELATION_STRAINS = 4.0  # 97 %, 88 %; a shorter one has the status ``short_sample``
 SAMPLE_CORRELATION_STRAINS = 6.0  # 97 %, 89 %; where the strain is not given
 LEAST_SAMPLE = 8.0  # strain, at least: 16 of the shortest correlation strains
-# A sample for an error: at least 96 %, 90 % over nine points, which narrower errors had
-# (``python -m benchmarks coverage --error 0.05``). It ends at the longer one of these limits of
-# cost, as 8 % of the samples did there.
+# A sample for an error of 0.05: at least 96 %, 90 % over nine points, which narrower errors had. It
+# ends at the longer one of these limits of cost, as 8 % of the samples did there.
 LONGEST_STRAIN = 256.0
 LONGEST_CORRELATION_STRAINS = 32.0
 

@@ -1,71 +1,20 @@
-"""Exact solutions of the contact problem, each with a certificate: the reference of tests and
-benchmarks.
+"""Exact solutions of small contact problems, each with a certificate.
 
-The problem is 0 ≤ J ⟂ w = W J + u⁻ ≥ 0 with W = G Gᵀ and G = H M^-½; see ``jaxgran.solver``. W is
-often singular. No method is trusted. Whatever a method returns is polished and then checked in
-extended precision; where the check fails, the next method is tried, and where all fail, an error is
-raised. So an answer cannot be wrong in silence, whatever the processor and its linear algebra.
+The problem is 0 ≤ J ⟂ w = W J + u⁻ ≥ 0 with W = G Gᵀ and G = H M^-½; W is often singular. The
+method is not trusted: what it returns is polished and then checked in extended precision, and an
+error is raised where the check fails. So an answer cannot be wrong in silence, whatever the
+processor and its linear algebra.
 """
-
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.optimize import nnls
 
 from jaxgran.contact.network import Contacts
 
 EPS = float(np.finfo(float).eps)
-# Of the largest term of w, that a residual may reach; the collection needs less than one.
-ROUNDINGS = 16
+ROUNDINGS = 16  # of the largest term of w, that a residual may reach
 RESIDUAL, ENERGY, OBSTACLE = 1e-11, 1e-10, 1e-12  # largest relative errors of what is certified
 _POLISHING_STEPS, _INTERIOR_STEPS = 10, 100
-Method = Callable[[np.ndarray, np.ndarray], np.ndarray]
-
-
-class Exact(NamedTuple):
-    """Exact solution of a network.
-
-    ==========  ===========  ====  =============================================================
-    field       shape        unit  meaning
-    ==========  ===========  ====  =============================================================
-    impulses    (contacts,)  mσγ̇   impulses J₀ at restitution zero; zero where there are none
-    changes     (grains, 2)  σγ̇    velocity changes M⁻¹ Hᵀ J₀, which are unique
-    residual    number       –     ‖min(diag(W) J, W J + u⁻)‖ over ‖min(u⁻, 0)‖
-    feasible    flag         –     False where no velocities satisfy all contacts
-    ==========  ===========  ====  =============================================================
-    """
-
-    impulses: np.ndarray
-    changes: np.ndarray
-    residual: float
-    feasible: bool
-
-
-def exact(contacts: Contacts, masses: np.ndarray) -> Exact:
-    """The exact solution of a network.
-
-    Args:
-      contacts: the network, in any padding.
-      masses: (grains,) in m.
-
-    Returns:
-      The certified solution. Where there is none, zero impulses.
-
-    Raises:
-      ArithmeticError: no method gave an answer that passes its check.
-    """
-    used = np.asarray(contacts.used)
-    roots = np.repeat(np.sqrt(masses), 2)
-    g = incidence(contacts, len(masses))[used] / roots
-    p = certified_impulses(g, np.asarray(contacts.approach)[used])
-    feasible = p is not None
-    p = np.zeros(len(g)) if p is None else p
-    impulses = np.zeros(len(used))
-    impulses[used] = p
-    residual = natural_residual(g, np.asarray(contacts.approach)[used], p)
-    return Exact(impulses, (g.T @ p / roots).reshape(-1, 2), residual, feasible)
 
 
 def incidence(contacts: Contacts, grains: int) -> np.ndarray:
@@ -81,22 +30,67 @@ def incidence(contacts: Contacts, grains: int) -> np.ndarray:
     return matrix.reshape(len(i), 2 * grains)
 
 
-def active_set(g: np.ndarray, approach: np.ndarray) -> np.ndarray:
-    """Multipliers q ≥ 0 from SciPy's non-negative least squares; they can be wrong, as it can end
-    early.
+def delassus(contacts: Contacts, masses: np.ndarray) -> np.ndarray:
+    """W = H M⁻¹ Hᵀ as a dense matrix."""
+    matrix = incidence(contacts, len(masses))
+    return matrix / np.repeat(masses, 2) @ matrix.T
+
+
+def weighted(contacts: Contacts, masses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """G and u⁻ of the contacts in use."""
+    used = np.asarray(contacts.used)
+    g = incidence(contacts, len(masses))[used] / np.repeat(np.sqrt(masses), 2)
+    return g, np.asarray(contacts.approach)[used]
+
+
+def exact_changes(contacts: Contacts, masses: np.ndarray) -> np.ndarray:
+    """Velocity changes M⁻¹ Hᵀ J (grains, 2) at restitution zero, which are unique: the projection,
+    in the norm of the kinetic energy, of the velocities on those that let no contact approach.
+    """
+    g, approach = weighted(contacts, masses)
+    impulses = certified_impulses(g, approach)
+    assert impulses is not None, "no impulses stop these contacts"
+    return (impulses @ g).reshape(-1, 2) / np.sqrt(masses)[:, None]
+
+
+def certified_impulses(g: np.ndarray, approach: np.ndarray) -> np.ndarray | None:
+    """Impulses J with 0 ≤ J ⟂ G Gᵀ J + u⁻ ≥ 0, to rounding.
 
     The velocity changes are the shortest vector x that satisfies G x ≥ −u⁻. Lawson and Hanson
     (Solving Least Squares Problems, 1974, chapter 23) turn this into min ‖E q − e‖ over q ≥ 0 with
     the columns (G_c, −u⁻_c) in E and e = (0, …, 0, 1). With r = 1 + u⁻·q, the impulses are q / r;
     where r = 0, there is no such x.
+
+    Args:
+      g: (contacts, freedoms), G = H M^-½; no row may be zero.
+      approach: (contacts,), u⁻.
+
+    Returns:
+      Impulses for which ``is_solution`` holds; None where there are none, as shown by
+      ``is_obstacle``.
+
+    Raises:
+      ArithmeticError: neither was found.
     """
-    unit = np.concatenate([np.zeros(g.shape[1]), [1.0]])
-    return nnls(np.concatenate([g.T, -approach[None]]), unit, maxiter=100 * len(g))[0]
+    if not np.any(approach < 0):
+        return np.zeros(len(g))
+    g = g[:, np.any(g != 0, axis=0)]  # without grains that have no contact
+    lengths = np.linalg.norm(g, axis=1)
+    rows, rates = g / lengths[:, None], approach / lengths
+    unit = np.linalg.norm(np.minimum(rates, 0))
+    q = np.maximum(_interior_point(rows, rates / unit), 0)
+    remainder = 1 + q @ rates / unit
+    if remainder > 0:
+        impulses = _polished(g, approach, unit * q / remainder / lengths)
+        if is_solution(g, approach, impulses):
+            return impulses
+    if is_obstacle(g, approach, _balanced(rows, q) / lengths):
+        return None
+    raise ArithmeticError(f"no certificate for {len(g)} contacts")
 
 
-def interior_point(g: np.ndarray, approach: np.ndarray) -> np.ndarray:
-    """The same multipliers from a primal-dual interior-point method, which never chooses a set of
-    contacts.
+def _interior_point(g: np.ndarray, approach: np.ndarray) -> np.ndarray:
+    """The multipliers q by a primal-dual interior-point method.
 
     Their conditions are 0 ≤ q ⟂ s = (G Gᵀ + u⁻u⁻ᵀ) q + u⁻ ≥ 0, a linear complementarity problem
     that always has a solution. Steps of a predictor and a corrector after Mehrotra; Wright
@@ -113,9 +107,9 @@ def interior_point(g: np.ndarray, approach: np.ndarray) -> np.ndarray:
             factor = cho_factor(matrix + np.diag(s / q))
         except LinAlgError:
             break
-        dq, ds = _step(factor, q, s, missing, np.zeros_like(q))
+        dq, ds = _newton_step(factor, q, s, missing, np.zeros_like(q))
         gap, after = q @ s / len(q), (q + _reach(q, dq) * dq) @ (s + _reach(s, ds) * ds) / len(q)
-        dq, ds = _step(factor, q, s, missing, (after / gap) ** 3 * gap - dq * ds)
+        dq, ds = _newton_step(factor, q, s, missing, (after / gap) ** 3 * gap - dq * ds)
         length = 0.995 * min(_reach(q, dq), _reach(s, ds))
         if not length > 1e-8:
             break
@@ -123,10 +117,10 @@ def interior_point(g: np.ndarray, approach: np.ndarray) -> np.ndarray:
     return q
 
 
-def _step(
+def _newton_step(
     factor: tuple, q: np.ndarray, s: np.ndarray, missing: np.ndarray, target: np.ndarray
-) -> tuple:
-    """The Newton step of q and s to q s = target and to no missing part of s."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """The step of q and s to q s = target and to no missing part of s."""
     change = cho_solve(factor, (target - q * s) / q - missing)
     return change, (target - q * s - s * change) / q
 
@@ -137,63 +131,10 @@ def _reach(values: np.ndarray, changes: np.ndarray) -> float:
     return float(np.min(-values[falling] / changes[falling], initial=1.0))
 
 
-METHODS: tuple[Method, ...] = (interior_point, active_set)
-
-
-def certified_impulses(
-    g: np.ndarray, approach: np.ndarray, methods: Sequence[Method] = METHODS
-) -> np.ndarray | None:
-    """Impulses J with 0 ≤ J ⟂ G Gᵀ J + u⁻ ≥ 0, to rounding.
-
-    Args:
-      g: (contacts, freedoms), G = H M^-½; no row may be zero.
-      approach: (contacts,), u⁻.
-      methods: tried in turn. Each returns multipliers q for contacts whose rows of G have the
-        length 1 and whose u⁻ has the length 1 where it is negative; see ``active_set``.
-
-    Returns:
-      Impulses for which ``is_solution`` holds; None where there are none, as shown by
-      ``is_obstacle``.
-
-    Raises:
-      ValueError: something is not finite, or a row is zero.
-      ArithmeticError: no method gave either.
-    """
-    lengths = np.linalg.norm(g, axis=1)
-    if not (np.all(np.isfinite(approach)) and np.all(np.isfinite(lengths)) and np.all(lengths > 0)):
-        raise ValueError(
-            "the contacts must have finite approach velocities and finite rows of G that are not "
-            "zero"
-        )
-    if not np.any(approach < 0):
-        return np.zeros(len(g))
-    g = g[:, np.any(g != 0, axis=0)]  # without grains that have no contact
-    rows, rates = g / lengths[:, None], approach / lengths
-    unit = np.linalg.norm(np.minimum(rates, 0))
-    for method in methods:
-        try:
-            q = np.maximum(method(rows, rates / unit), 0)
-            left = 1 + q @ rates / unit
-            if left > 0 and is_solution(
-                g, approach, p := _polished(g, approach, unit * q / left / lengths)
-            ):
-                return p
-            if is_obstacle(g, approach, balanced(rows, q) / lengths):
-                return None
-        except (LinAlgError, RuntimeError):  # a factorisation fails, or SciPy's iterations end
-            continue
-    raise ArithmeticError(
-        f"no exact solution of {len(g)} contacts: none of {len(methods)} methods passed the check"
-    )
-
-
 def natural_residual(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> float:
-    """‖min(diag(W) J, W J + u⁻)‖ over ‖min(u⁻, 0)‖, in extended precision; zero where nothing
-    approaches or pushes.
-    """
+    """‖min(diag(W) J, W J + u⁻)‖ over ‖min(u⁻, 0)‖, in extended precision."""
     least = np.minimum(np.sum(g**2, axis=1) * impulses, _after(g, approach, impulses))
-    scale = np.linalg.norm(np.minimum(approach, 0))
-    return float(np.linalg.norm(least) / scale) if scale > 0 else float(np.linalg.norm(least))
+    return float(np.linalg.norm(least) / np.linalg.norm(np.minimum(approach, 0)))
 
 
 def is_solution(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> bool:
@@ -208,8 +149,7 @@ def is_solution(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> bo
       approach in rounding;
     - a bound of the kinetic energy of the error of the velocity changes, at most ``ENERGY`` of that
       of the changes. For exact J₀ and w₀, (J − J₀)ᵀ W (J − J₀) = (J − J₀)·(w − w₀) ≤ J·w − J₀·w ≤ Σ
-      J |w| + Σ J₀ max(−w), where Σ J stands for the unknown Σ J₀. Rounding of J alone makes it ε Σ
-      J |w|, at a mass ratio of 10⁴ some 10⁻¹¹.
+      J |w| + Σ J₀ max(−w), where Σ J stands for the unknown Σ J₀.
     """
     if not (np.all(np.isfinite(impulses)) and np.all(impulses >= 0)):
         return False
@@ -251,20 +191,20 @@ def _after(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> np.ndar
 def _polished(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> np.ndarray:
     """The best of the impulses and of those after Newton steps on the natural residual (Facchinei
     and Pang, Finite-Dimensional Variational Inequalities, 2003, chapter 9), whose right-hand side
-    is in extended precision."""
-    own = np.sum(g**2, axis=1)
+    is in extended precision.
+    """
+    diagonal = np.sum(g**2, axis=1)
     best, least = impulses, natural_residual(g, approach, impulses)
     for _ in range(_POLISHING_STEPS):
         after = _after(g, approach, impulses)
-        push = own * impulses > after
-        left, lengths, _ = np.linalg.svd(g[push], full_matrices=False)
+        pressing = diagonal * impulses > after
+        left, lengths, _ = np.linalg.svd(g[pressing], full_matrices=False)
         kept = lengths > 1e-10 * np.max(lengths, initial=0)
         left = left[:, kept]
-        better = np.zeros_like(impulses)
-        better[push] = impulses[push] - left @ (
-            (left.T @ after[push].astype(float)) / lengths[kept] ** 2
-        )
-        impulses = better
+        step = left @ ((left.T @ after[pressing].astype(float)) / lengths[kept] ** 2)
+        changed = np.zeros_like(impulses)
+        changed[pressing] = impulses[pressing] - step
+        impulses = changed
         residual = natural_residual(g, approach, np.maximum(impulses, 0))
         if residual < least:
             best, least = np.maximum(impulses, 0), residual
@@ -273,11 +213,10 @@ def _polished(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> np.n
     return best
 
 
-def balanced(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def _balanced(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """The nearest weights on the same contacts with Gᵀ q = 0, none negative."""
     held = weights > 1e-8 * np.max(weights)
-    result = np.zeros_like(weights)
-    result[held] = weights[held]
+    result = np.where(held, weights, 0)
     for _ in range(2):
         result[held] -= np.linalg.lstsq(rows[held].T, result[held] @ rows[held])[0]
     return np.maximum(result, 0)
