@@ -62,8 +62,10 @@ def test_every_observable_has_its_dimensions_and_errors(data) -> None:
         path = path_of(name)
         assert data[path].dims == ("packing_fraction", "restitution", *row.axes)
         assert (f"{path}_stderr" in data) == (row.group != "diagnostics")
+        linked = data[path].attrs["ancillary_variables"].split()
+        assert linked[-1] == ("status" if row.group == "/" else "/status")
         if row.group != "diagnostics":
-            assert data[f"{path}_stderr"].dims == data[path].dims
+            assert data[f"{path}_stderr"].dims == data[path].dims and f"{name}_stderr" in linked
 
 
 def test_a_file_of_another_format_is_refused_in_a_sentence(few, tmp_path: Path) -> None:

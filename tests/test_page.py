@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from command_line import jaxgran
-from made_up_maps import ratio_dataset
+from made_up_maps import ratio_dataset, with_grains
 from pages import MARKUP, page_map
 from synthetic import one_sentence, random_instant
 
@@ -123,6 +123,13 @@ def test_instant_is_packed_without_visible_loss() -> None:
     expected = [*middles.T, *along.T, widths]
     np.testing.assert_allclose(np.multiply(lengths, unit), expected, atol=unit)
     np.testing.assert_array_equal(clustered, instant.clustered[pairs])
+
+
+def test_numbers_of_grains_are_an_axis_or_stand_at_their_points() -> None:
+    data = ratio_dataset(2, 2)
+    assert texts_of(map_data(with_grains(data, 64, 256)), "grains") == ["64", "256"]
+    page = map_data(data.assign(point_grains=(data.force_ratio.dims, [[64, 90], [128, 256]])))
+    assert [re.search(r"N = (\d+)", x)[1] for x in page["headings"]] == ["64", "90", "128", "256"]
 
 
 @pytest.mark.parametrize("shape", [(1000, 1000), (1, 100_000)])
