@@ -6,14 +6,15 @@ import threading
 import time
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from flows import GRAINS
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.numba_engine import ffi
+from jaxgran.maps.batches import replica_ids
+from jaxgran.maps.run import run_replicas
+from jaxgran.maps.settings import MapSettings
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 from jaxgran.sampling.sampler import sample
@@ -34,30 +35,44 @@ def test_machine_code_that_is_stopped_ends_as_failed_and_runs_again(engines, flo
 
 
 @pytest.fixture
-def ctrl_c():
-    """Ctrl-C as a terminal has it: a shell ignores it for what it runs in the background."""
+def interrupted():
+    """Calls a function, with Ctrl-C half a second later, which ends it within a second.
+
+    A shell ignores Ctrl-C for what it runs in the background.
+    """
+    if not hasattr(signal, "pthread_kill"):
+        pytest.skip("no signals to a thread")
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
+
+    def call(function) -> None:
+        pressed = []
+
+        def press() -> None:
+            pressed.append(time.monotonic())
+            os.kill(os.getpid(), signal.SIGINT)
+
+        threading.Timer(0.5, press).start()
+        with pytest.raises(KeyboardInterrupt):
+            function()
+        assert time.monotonic() - pressed[0] < SECOND
+        computing = time.process_time()
+        time.sleep(0.2)
+        assert time.process_time() - computing < 0.1  # nothing goes on beside
+
+    yield call
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="no signals to a thread")
-def test_a_sample_of_hours_ends_within_a_second_of_ctrl_c(flowing, ctrl_c) -> None:
+def test_a_sample_of_hours_ends_within_a_second_of_ctrl_c(flowing, interrupted) -> None:
     state = flowing(0.7)
     _, before = sample(FLOW, state, 0.1)
-    sent = []
-
-    def interrupt() -> None:
-        sent.append(time.monotonic())
-        os.kill(os.getpid(), signal.SIGINT)
-
-    timer = threading.Timer(0.5, interrupt)
-    timer.start()
-    with pytest.raises(KeyboardInterrupt):
-        sample(replace(FLOW, timestep=1e-5), state, 1e4)
-    assert time.monotonic() - sent[0] < SECOND
-    computing = time.process_time()
-    time.sleep(0.2)
-    assert time.process_time() - computing < 0.1  # nothing goes on beside
+    interrupted(lambda: sample(replace(FLOW, timestep=1e-5), state, 1e4))
     _, after = sample(FLOW, state, 0.1)
-    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.array_equal(a, b)), before, after))
+    assert before == after
+
+
+def test_replicas_of_hours_end_within_a_second_of_ctrl_c(interrupted) -> None:
+    settings = MapSettings(
+        (0.7,), (0.6,), grains=32, seeds=2, timestep=1e-3, equilibrate=0.0, strain=1e5
+    )
+    interrupted(lambda: list(run_replicas(settings, replica_ids(settings), workers=2)))

@@ -4,8 +4,9 @@ refused in a sentence.
 
 import shlex
 from dataclasses import replace
+from functools import partial
+from itertools import product
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -18,7 +19,6 @@ from hypothesis import strategies as st
 from synthetic import random_replica, random_state, refused
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
-from jaxgran.dynamics.engine import Numba
 from jaxgran.maps.batches import points_of_part, predicted_cost, replica_ids
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.merge import merge_maps
@@ -28,7 +28,6 @@ from jaxgran.maps.results import open_map
 from jaxgran.maps.rows import measured_ids
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.status_report import bad_points
-from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 
 SETTINGS = MapSettings((0.5, 0.7, 0.9), (0.5, 0.6), grains=64, seeds=3, strain=2.0, snapshots=True)
@@ -41,15 +40,12 @@ def replicas() -> dict[tuple[int, int], Replica]:
     """The replicas of all points: one that is not steady, one that is infeasible, and one that is
     not finite.
     """
-    rng, bad = (
-        np.random.default_rng(0),
-        {(0, 1): Status.not_steady, (1, 0): Status.infeasible, (2, 2): Status.nonfinite},
-    )
-    keys = [(point, seed) for point in range(6) for seed in range(3)]
-    made = {key: random_replica(rng, SETTINGS, bad.get(key, Status.ok), *key) for key in keys}
-    return {
-        key: one._replace(state=random_state(10 * key[0] + key[1])) for key, one in made.items()
-    }
+    bad = {(0, 1): Status.not_steady, (1, 0): Status.infeasible, (2, 2): Status.nonfinite}
+    rng, made = np.random.default_rng(0), {}
+    for point, seed in product(range(6), range(3)):
+        replica = random_replica(rng, SETTINGS, bad.get((point, seed), Status.ok), point, seed)
+        made[point, seed] = replica._replace(state=random_state(10 * point + seed))
+    return made
 
 
 def of_seeds(
@@ -89,21 +85,13 @@ def test_the_files_of_parts_make_the_map_of_one_run(replicas, tmp_path: Path) ->
 def test_maps_of_other_seeds_make_the_map_of_all_seeds_with_the_scatter_between_them(
     replicas,
 ) -> None:
-    first, second = of_seeds(replicas, 0, 1), of_seeds(replicas, 1, 2)
-    merged = merge_maps([second, first])
-    assert_one_run(merged, of_seeds(replicas, 0, 3))
-    assert merged.attrs["wall_time_seconds"] == 4.0
-    assert merged["sums"].sizes["seed"] == 3 and not merged.force_ratio_stderr.equals(
-        first.force_ratio_stderr
-    )
-
-
-def test_seeds_of_a_number_that_carries_a_rounding_error_are_pooled_with_those_of_its_decimals(
-    replicas,
-) -> None:
-    first, second = of_seeds(replicas, 0, 1), of_seeds(replicas, 1, 2)
-    first.coords["restitution"] = [0.5, np.nextafter(0.7, 1), 0.9]
-    assert_one_run(merge_maps([first, second]), of_seeds(replicas, 0, 3))
+    first, rounded, second = (of_seeds(replicas, *seeds) for seeds in ((0, 1), (0, 1), (1, 2)))
+    rounded.coords["restitution"] = [0.5, np.nextafter(0.7, 1), 0.9]
+    for some in (first, rounded):
+        merged = merge_maps([second, some])
+        assert_one_run(merged, of_seeds(replicas, 0, 3))
+        assert merged.attrs["wall_time_seconds"] == 4.0
+        assert not merged.force_ratio_stderr.equals(first.force_ratio_stderr)
 
 
 def test_a_point_of_fewer_seeds_than_others_is_measured(replicas) -> None:
@@ -123,7 +111,6 @@ def of_axes(replicas: dict[tuple[int, int], Replica], **axes: Any) -> xr.DataTre
 UNIONS: dict[str, Any] = {
     "lists": ({"restitution": (0.9, 0.5)}, {"restitution": (0.7,)}, {}),
     "lists that overlap": ({"restitution": (0.5, 0.7)}, {"restitution": (0.7, 0.9)}, {}),
-    "a map and one of its points": ({}, {"restitution": (0.7,), "packing_fraction": (0.6,)}, {}),
     "points far from each other": (
         {"restitution": (0.5,), "packing_fraction": (0.5,)},
         {"restitution": (0.9,), "packing_fraction": (0.6,)},
@@ -148,45 +135,36 @@ def test_maps_of_other_axes_make_the_map_of_all_that_they_have(replicas, name: s
     assert_one_run(merge_maps(maps), whole)
 
 
-def earlier(data: xr.DataTree) -> xr.DataTree:
-    """The same map, made with an earlier version of JAX."""
-    data.attrs["version_jax"] = "0.1"
+def with_other(name: str, data: xr.DataTree) -> xr.DataTree:
+    """The map with another attribute, as one of another version or of other sources."""
+    data.attrs[name] = "other"
     return data
 
 
 def without_a_sum(data: xr.DataTree) -> xr.DataTree:
-    """The map with a running sum less, as of another version."""
     data["sums"] = data["sums"].to_dataset().isel(quantity=slice(-1))
     return data
 
 
-def other_sources(data: xr.DataTree) -> xr.DataTree:
-    data.attrs["code_digest"] = "other"
-    return data
-
-
 REFUSED: dict[str, Any] = {
-    "strain is 2.0 in map 0 and 3.0 in map 1": lambda x: [
-        of_seeds(x, 0, 1),
-        of_seeds(x, 1, 1, strain=3.0),
-    ],
-    "restitution is .* in map 0 and .* in map 1": lambda x: [
-        of_axes(x, grains_by_point=(64,) * 6),
-        of_axes(x, restitution=(0.7,)),
-    ],
+    "strain is 2.0 in map 0 and 3.0 in map 1": (
+        lambda x: [of_seeds(x, 0, 1), of_seeds(x, 1, 1, strain=3.0)]
+    ),
+    "restitution is .* in map 0 and .* in map 1": (
+        lambda x: [of_axes(x, grains_by_point=(64,) * 6), of_axes(x, restitution=(0.7,))]
+    ),
     "seed 1 is missing": lambda x: [of_seeds(x, 0, 1), of_seeds(x, 2, 1)],
-    "by their number of seeds": lambda x: [
-        of_seeds(x, 0, 1, error=0.1),
-        of_seeds(x, 1, 1, error=0.1),
-    ],
-    "version_jax is '0.1' in map 0": lambda x: [earlier(of_seeds(x, 0, 1)), of_seeds(x, 1, 1)],
-    "code_digest is 'other' in map 0": lambda x: [
-        other_sources(of_seeds(x, 0, 1)),
-        of_seeds(x, 1, 1),
-    ],
+    "by their number of seeds": (
+        lambda x: [of_seeds(x, 0, 1, error=0.1), of_seeds(x, 1, 1, error=0.1)]
+    ),
+    "version_jax is 'other' in map 0": (
+        lambda x: [with_other("version_jax", of_seeds(x, 0, 1)), of_seeds(x, 1, 1)]
+    ),
+    "code_digest is 'other' in map 0": (
+        lambda x: [with_other("code_digest", of_seeds(x, 0, 1)), of_seeds(x, 1, 1)]
+    ),
     "must have the group sums": lambda x: [of_seeds({}, 0, 1)],
     "the running sums of this version": lambda x: [without_a_sum(of_seeds(x, 0, 1))],
-    "a list of at least one map": lambda _: [],
     "a list of at least one map or file, not 'map.nc'": lambda _: "map.nc",
 }
 
@@ -218,68 +196,38 @@ def test_an_array_job_of_the_page_makes_the_map_of_one_process(tmp_path: Path) -
         "--strain 0.32"
     )
     task = task.replace("--preset paper", tiny).replace("$SLURM_ARRAY_TASK_COUNT", "2")
+    commands = [task.replace("$SLURM_ARRAY_TASK_ID", number) for number in "12"]
+    commands += [merge.replace("parts/*.nc", "parts/1.nc parts/2.nc")]
+    commands += [f"jaxgran map {tiny} --workers 1 --output whole.nc"]
     (tmp_path / "parts").mkdir()
-    for number in "12":
-        words = shlex.split(task.replace("$SLURM_ARRAY_TASK_ID", number))
-        outcome = in_a_process(tmp_path, *words[1:])
+    for command in commands:
+        outcome = in_a_process(tmp_path, *shlex.split(command)[1:])
         assert outcome.status == 3, outcome.err  # so short a preparation is not steady
         assert "not run" not in outcome.err
-    merged = in_a_process(
-        tmp_path, *shlex.split(merge.replace("parts/*.nc", "parts/1.nc parts/2.nc"))[1:]
-    )
-    assert merged.status == 3 and "Force ratio" in merged.out and "not run" not in merged.err
-    whole = in_a_process(tmp_path, "map", *tiny.split(), "--workers", "1", "--output", "whole.nc")
-    assert whole.status == 3
     assert_one_run(open_map(tmp_path / "paper.nc"), open_map(tmp_path / "whole.nc"))
-    again = in_a_process(
-        tmp_path, *shlex.split(merge.replace("parts/*.nc", "parts/1.nc parts/1.nc"))[1:]
-    )
-    assert again.status == 2 and "--output 'paper.nc' already exists" in again.err
 
 
 @pytest.mark.filterwarnings("ignore::jaxgran.maps.status_report.BadPoints")
 def test_a_map_of_a_users_observable_is_merged_with_its_function() -> None:
     def observe(seen) -> dict[str, Any]:
-        return {
-            "side": seen.state.side,
-            "normals": (seen.contacts.normals * seen.impulses[:, None]).sum(0),
-        }
+        return {"side": seen.state.side, "pushes": seen.impulses.sum()}
 
-    given: dict[str, Any] = {
-        "grains": 16,
-        "equilibrate": 0.0,
-        "strain": 0.32,
-        "observe": observe,
-        "workers": 1,
-    }
-    maps = [ratio_map([0.9], [0.5, 0.6], **given, seeds=1, first_seed=seed) for seed in (0, 1)]
-    assert_one_run(
-        merge_maps(maps, observe=observe), ratio_map([0.9], [0.5, 0.6], **given, seeds=2)
-    )
+    run = partial(ratio_map, [0.9], [0.5], grains=16, equilibrate=0.0, strain=0.32, observe=observe)
+    maps = [run(seeds=1, first_seed=seed) for seed in (0, 1)]
+    assert_one_run(merge_maps(maps, observe=observe), run(seeds=2))
     for other in (None, lambda _: {"a": 1.0}):
-        with pytest.raises(
-            InputError, match="observe must be the function of the maps, which is normals, side: "
-        ):
+        with refused("observe must be the function of the maps, which is pushes, side: "):
             merge_maps(maps, observe=other)
 
 
 def test_maps_in_double_precision_are_merged_in_it_by_a_process_that_computes_in_single(
     replicas,
 ) -> None:
-    parts, whole = [of_seeds(replicas, 0, 1), of_seeds(replicas, 1, 2)], of_seeds(replicas, 0, 3)
+    parts = [of_seeds(replicas, 0, 1), of_seeds(replicas, 1, 2)]
     with jax.enable_x64(False):
         merged = merge_maps(parts)
-    assert_one_run(merged, whole, but=("solver", "engine"))
+    assert_one_run(merged, of_seeds(replicas, 0, 3), but=("solver", "engine"))
     assert merged["theory"].pressure.dtype == np.float64
-
-
-def test_maps_of_an_engine_are_merged_where_it_cannot_run(replicas, monkeypatch) -> None:
-    parts = [of_seeds(replicas, 0, 1, engine=Numba()), of_seeds(replicas, 1, 2, engine=Numba())]
-    whole = of_seeds(replicas, 0, 3, engine=Numba())
-    monkeypatch.setattr(
-        "jaxgran.dynamics.engine.default_device", lambda: SimpleNamespace(platform="gpu")
-    )
-    assert_one_run(merge_maps(parts), whole)
 
 
 class Own(BarzilaiBorwein):
@@ -293,14 +241,3 @@ def test_maps_of_a_users_solver_are_merged_with_it(replicas) -> None:
     for other in (None, Own(), BarzilaiBorwein(tolerance=1e-3)):
         with refused("solver must be that of the maps, which is .*Own"):
             merge_maps(parts, solver=other)
-
-
-def test_statuses_of_a_map_are_read_by_the_names_that_it_has(replicas) -> None:
-    data = of_seeds(replicas, 0, 3)
-    status = data["sums"].status
-    renumbered = status.copy(data=np.where(status >= 2, status + 10, status))
-    renumbered.attrs["flag_values"] = np.where(
-        status.flag_values >= 2, status.flag_values + 10, status.flag_values
-    )
-    data["sums"]["status"] = renumbered
-    assert_one_run(merge_maps([data]), of_seeds(replicas, 0, 3))

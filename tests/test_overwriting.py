@@ -2,7 +2,6 @@
 --overwrite is given.
 """
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -26,35 +25,21 @@ MAP = ("map", *POINTS, "--seeds", "1")
 BOTH = {(0, 0): Status.ok, (1, 0): Status.ok}
 
 
-def made_up_maps(patch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True)
+def made_up(monkeypatch) -> None:
     """Maps of made-up replicas, whose pictures are files of a few bytes.
 
     Their own files have what is printed and what decides which pictures there are.
     """
-    write_without_drawing(patch)
-    write_few_variables(patch, *LARGE_SYSTEM, *CLUSTERS)
-    patch.setattr(ratio_map_module, "run_replicas", made_up_replicas(BOTH))
-
-
-@pytest.fixture(autouse=True)
-def made_up(monkeypatch) -> None:
-    made_up_maps(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a finished map."""
-    folder = tmp_path_factory.mktemp("finished")
-    with pytest.MonkeyPatch.context() as patch:
-        made_up_maps(patch)
-        assert jaxgran(folder, *MAP).status == 0
-    return folder
+    write_without_drawing(monkeypatch)
+    write_few_variables(monkeypatch, *LARGE_SYSTEM, *CLUSTERS)
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(BOTH))
 
 
 @pytest.fixture
-def finished(original: Path, tmp_path: Path) -> bytes:
+def finished(made_up, tmp_path: Path) -> bytes:
     """The content of a finished map, jaxgran_map.nc."""
-    shutil.copytree(original, tmp_path, dirs_exist_ok=True)
+    assert jaxgran(tmp_path, *MAP).status == 0
     return (tmp_path / "jaxgran_map.nc").read_bytes()
 
 
@@ -70,9 +55,7 @@ def test_a_map_of_other_parameters_is_refused_and_the_first_of_them_named(
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished and files(tmp_path) == before
     assert jaxgran(tmp_path, *MAP, "--grains", "64", "--overwrite").status == 0
     assert open_map(tmp_path / "jaxgran_map.nc").attrs["grains"] == 64
-    assert "jaxgran_map_timestep.png" not in files(tmp_path) and "jaxgran_map_notes.png" in files(
-        tmp_path
-    )
+    assert before - files(tmp_path) == {"jaxgran_map_timestep.png"}
 
 
 def test_what_is_no_map_is_not_replaced(tmp_path: Path) -> None:
@@ -88,24 +71,11 @@ def test_a_finished_map_is_taken_from_its_file_by_resume(
     monkeypatch.setattr(ratio_map_module, "run_replicas", None)  # nothing is run
     (tmp_path / "jaxgran_map_curves.png").unlink()
     outcome = jaxgran(tmp_path, *MAP, "--resume")
-    assert outcome.status == 0
+    assert outcome.status == 0 and "Force ratio" in outcome.out
     assert "jaxgran_map.nc is finished and is read from its file." in outcome.err
-    assert (
-        "wrote jaxgran_map_curves.png" in outcome.err and "wrote jaxgran_map.nc" not in outcome.err
-    )
-    assert "Force ratio" in outcome.out
+    assert "wrote jaxgran_map_curves.png" in outcome.err
+    assert "wrote jaxgran_map.nc" not in outcome.err
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
-    assert_one_sentence(other := jaxgran(tmp_path, *MAP, "--resume", "--grains", "64"))
-    assert "has a map with restitution 0.5, packing fraction 0.6, grains 256" in other.err
-
-
-def test_the_same_map_replaces_a_finished_one_only_where_that_is_said(
-    finished: bytes, tmp_path: Path
-) -> None:
-    assert_one_sentence(again := jaxgran(tmp_path, *MAP))
-    assert "already exists and has this map; pass --resume to keep its points" in again.err
-    assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
-    assert jaxgran(tmp_path, *MAP, "--overwrite").status == 0
 
 
 def test_a_finished_map_of_other_code_is_not_taken_for_one_of_this(
@@ -121,36 +91,28 @@ def test_a_finished_map_of_other_code_is_not_taken_for_one_of_this(
 
 
 def test_figures_are_those_of_the_data_that_a_command_wrote(tmp_path: Path, monkeypatch) -> None:
-    half = dict(list(BOTH.items())[:1])
+    half = made_up_replicas({(0, 0): Status.ok}, KeyboardInterrupt)
     with monkeypatch.context() as patch:
-        patch.setattr(ratio_map_module, "run_replicas", made_up_replicas(half, KeyboardInterrupt))
+        patch.setattr(ratio_map_module, "run_replicas", half)
         assert jaxgran(tmp_path, *MAP).status == 130
-    for name in ("curves.png", "curves.pdf"):
-        (tmp_path / f"jaxgran_map_{name}").write_bytes(b"of the half")
+    png, pdf = tmp_path / "jaxgran_map_curves.png", tmp_path / "jaxgran_map_curves.pdf"
+    for picture in (png, pdf):
+        picture.write_bytes(b"of the half")
     resumed = jaxgran(tmp_path, *MAP, "--resume")
-    assert resumed.status == 0 and "jaxgran_map_curves.pdf shows the map as it was" in resumed.err
-    assert (tmp_path / "jaxgran_map_curves.png").read_bytes() != b"of the half"
-    assert (tmp_path / "jaxgran_map_curves.pdf").read_bytes() == b"of the half"
+    assert resumed.status == 0 and f"{pdf.name} shows the map as it was" in resumed.err
+    assert png.read_bytes() != b"of the half" == pdf.read_bytes()
 
 
 def test_an_interrupted_map_does_not_replace_a_finished_one(
     finished: bytes, tmp_path: Path, monkeypatch
 ) -> None:
-    half = dict(list(BOTH.items())[:1])
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(half, KeyboardInterrupt))
-    for words in (["--overwrite"], ["--grains", "64", "--overwrite"]):
-        outcome = jaxgran(tmp_path, *MAP, *words)
-        assert outcome.status == 130
-        assert (
-            "1 point missing; finished points are saved" in outcome.err
-            and "wrote" not in outcome.err
-        )
-        assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
-        unfinished = tmp_path / "jaxgran_map.nc.unfinished"
-        assert len(list(unfinished.glob("replica-*.npz"))) == 1
-        for path in unfinished.iterdir():
-            path.unlink()
-        unfinished.rmdir()
+    half = made_up_replicas({(0, 0): Status.ok}, KeyboardInterrupt)
+    monkeypatch.setattr(ratio_map_module, "run_replicas", half)
+    outcome = jaxgran(tmp_path, *MAP, "--grains", "64", "--overwrite")
+    assert outcome.status == 130
+    assert "1 point missing; finished points are saved" in outcome.err
+    assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
+    assert len(list((tmp_path / "jaxgran_map.nc.unfinished").glob("replica-*.npz"))) == 1
 
 
 def test_plot_and_a_map_without_overwrite_remove_nothing(finished: bytes, tmp_path: Path) -> None:
@@ -163,25 +125,20 @@ def test_plot_and_a_map_without_overwrite_remove_nothing(finished: bytes, tmp_pa
     assert {(tmp_path / name).read_bytes() for name in names} == {b"by hand"}
 
 
-@pytest.mark.parametrize("command", ["map", "merge"])
+@pytest.mark.parametrize("command", [MAP, ("merge", "jaxgran_map.nc")], ids=["map", "merge"])
 def test_a_new_map_replaces_no_file_by_a_figure(
-    finished: bytes, command: str, tmp_path: Path, monkeypatch
+    finished: bytes, command: tuple[str, ...], tmp_path: Path, monkeypatch
 ) -> None:
     monkeypatch.setattr("jaxgran.maps.merge.merge_maps", lambda paths: open_map(paths[0]))
-    (tmp_path / "ratio_theory.png").write_bytes(b"by hand")
+    picture = tmp_path / "ratio_theory.png"
+    picture.write_bytes(b"by hand")
     before = files(tmp_path)
-    words = MAP if command == "map" else ("merge", "jaxgran_map.nc")
-    outcome = jaxgran(tmp_path, *words, "--output", "ratio.nc")
+    outcome = jaxgran(tmp_path, *command, "--output", "ratio.nc")
     assert_one_sentence(outcome)
-    assert (
-        "the figure 'ratio_theory.png' already exists; name another output, or pass "
-        "--overwrite to replace it" in outcome.err
-    )
-    assert files(tmp_path) == before and (tmp_path / "ratio_theory.png").read_bytes() == b"by hand"
-    assert jaxgran(tmp_path, *words, "--output", "ratio.nc", "--overwrite").status == 0
-    assert (
-        tmp_path / "ratio_theory.png"
-    ).read_bytes() == b"by hand"  # a line of points has no such figure
+    assert "the figure 'ratio_theory.png' already exists; name another output" in outcome.err
+    assert files(tmp_path) == before
+    assert jaxgran(tmp_path, *command, "--output", "ratio.nc", "--overwrite").status == 0
+    assert picture.read_bytes() == b"by hand"  # a line of points has no such figure
 
 
 def test_a_page_replaces_no_file(finished: bytes, tmp_path: Path) -> None:
@@ -189,36 +146,20 @@ def test_a_page_replaces_no_file(finished: bytes, tmp_path: Path) -> None:
     page.write_bytes(b"notes")
     outcome = jaxgran(tmp_path, "explore", "jaxgran_map.nc")
     assert_one_sentence(outcome)
-    assert (
-        "--output 'jaxgran_map.html' already exists; name another file, or pass --overwrite"
-        in outcome.err
-    )
+    assert "--output 'jaxgran_map.html' already exists; name another file" in outcome.err
     assert page.read_bytes() == b"notes"
     assert jaxgran(tmp_path, "explore", "jaxgran_map.nc", "--overwrite").status == 0
     assert page.read_bytes() != b"notes"
 
 
-RUN = (
-    "run",
-    "--restitution",
-    "0.5",
-    "--packing-fraction",
-    "0.6",
-    "--grains",
-    "32",
-    "--output",
-    "flow.nc",
-)
+RUN = "run --restitution 0.5 --packing-fraction 0.6 --grains 32 --output flow.nc"
 
 
 @pytest.mark.parametrize("option", ["trajectory", "movie"])
 def test_frames_are_not_replaced(option: str, tmp_path: Path) -> None:
     file = tmp_path / ("flow.gsd" if option == "trajectory" else "flow.gif")
     file.write_bytes(b"frames")
-    outcome = jaxgran(tmp_path, *RUN, f"--{option}", file.name)
+    outcome = jaxgran(tmp_path, *RUN.split(), f"--{option}", file.name)
     assert_one_sentence(outcome)
-    assert (
-        f"--{option} {file.name!r} already exists; name another file, or pass --overwrite"
-        in outcome.err
-    )
+    assert f"--{option} {file.name!r} already exists; name another file" in outcome.err
     assert files(tmp_path) == {file.name}

@@ -42,29 +42,26 @@ def test_second_process_neither_traces_nor_compiles(folder: Path) -> None:
     np.testing.assert_array_equal(second["product"], [0.0, 2.0, 4.0])
 
 
-@pytest.mark.parametrize(
-    "change", ["shape", "precision", "structure", "flag of JAX", "source, version or processor"]
-)
+PAIR, FACTOR = ARGUMENTS
+CHANGED = {
+    "shape": (tuple(np.append(x, 1.0) for x in PAIR), FACTOR),
+    "precision": (tuple(x.astype(np.float32) for x in PAIR), np.float32(2.0)),
+    "structure": (list(PAIR), FACTOR),
+    "flag of JAX": ARGUMENTS,
+    "source, version or processor": ARGUMENTS,
+}
+
+
+@pytest.mark.parametrize("change", CHANGED)
 def test_whatever_a_program_depends_on_compiles_it_again(
     folder: Path, change: str, monkeypatch
 ) -> None:
     traces: list = []
     counted(traces)(*ARGUMENTS)
-    pair, factor = ARGUMENTS
-    if change == "shape":
-        pair = tuple(np.append(x, 1.0) for x in pair)
-    elif change == "precision":
-        pair, factor = tuple(x.astype(np.float32) for x in pair), np.float32(2.0)
-    elif change == "structure":
-        pair = list(pair)
-    elif change == "flag of JAX":
-        with jax.numpy_dtype_promotion("standard"):
-            counted(traces)(pair, factor)
-        assert len(traces) == 2
-        return
-    else:
+    if change.startswith("source"):
         monkeypatch.setattr(persistent_jit, "_origin", lambda: "another")
-    counted(traces)(pair, factor)
+    with jax.numpy_dtype_promotion("standard" if change == "flag of JAX" else "strict"):
+        counted(traces)(*CHANGED[change])
     assert len(traces) == 2
 
 

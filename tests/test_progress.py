@@ -13,9 +13,8 @@ from jaxgran.maps.automatic import (
     expected_correlation_strain,
     expected_costs,
     expected_seconds,
-    plans_of_sizes,
 )
-from jaxgran.maps.batches import predicted_cost, replica_cost, replica_ids
+from jaxgran.maps.batches import predicted_cost, replica_ids
 from jaxgran.maps.progress import Meter
 from jaxgran.maps.replica import Advance
 from jaxgran.maps.results import open_map
@@ -105,17 +104,3 @@ def test_outside_the_reference_map_the_expected_correlation_strain_is_that_of_ki
     np.testing.assert_allclose(
         expected_correlation_strain(settings, flows, [64, 64]), heating, rtol=0.1
     )
-
-
-def test_the_cost_of_a_replica_is_that_of_its_expected_strains() -> None:
-    """Preparation and sample are several correlation strains, or what is given."""
-    own, _ = chosen_settings({**MAP, "seeds": 1})
-    large, _ = chosen_settings({**MAP, "grains": 6400, "seeds": 1})
-    given, (large_cost, *_) = replica_cost(FLOW, 1.0, 4.0), expected_costs(large).values()
-    own_cost = expected_costs(own)[own.points[0]]
-    assert expected_costs(SETTINGS)[SETTINGS.points[0]] == given < own_cost
-    assert large_cost > 100 * own_cost
-    precise, _ = chosen_settings({**MAP, "grains": 6400, "seeds": 1, "error": 0.05})
-    strains = plans_of_sizes(precise, 0.05, np.array([6400])).strain[:, 0]
-    precise_cost = expected_costs(precise)[precise.points[0]]
-    assert precise_cost > replica_cost(FLOW, 0.0, strains[0]) * 100

@@ -59,17 +59,11 @@ def test_a_plane_in_any_order_is_sorted_with_the_grains_of_its_points() -> None:
 
 
 def test_grains_and_time_step_are_dimensions_where_they_have_several_values() -> None:
-    one, some = (
-        MapSettings(**GOOD),
-        MapSettings(**{**GOOD, "grains": (64, 256), "timestep": (1e-3, 1e-4)}),
-    )
-    assert (one.sizes, some.sizes) == ((64,), (64, 256))
+    one = MapSettings(**GOOD)
+    some = replace(one, grains=(64, 256), timestep=(1e-3, 1e-4))
     assert one.dimensions == ("packing_fraction", "restitution")
     assert some.dimensions == ("grains", "timestep", "packing_fraction", "restitution")
-    points = [
-        (flow.grains, flow.timestep, flow.packing_fraction, flow.restitution)
-        for flow in some.flows.values()
-    ]
+    points = [tuple(getattr(flow, x) for x in some.dimensions) for flow in some.flows.values()]
     assert points == some.points == list(product(*some.axes.values()))
     assert some.points[:2] == one.points
 
@@ -87,15 +81,13 @@ def test_automatic_time_step_does_not_depend_on_the_numbers_of_grains() -> None:
 
 def test_the_automatic_time_step_is_the_shortest_that_a_point_needs() -> None:
     plane = {"restitution": (0.9, 0.2), "packing_fraction": (0.6, 0.82)}
-    given = {**GOOD, "timestep": "auto", "grains": (64, 256), "strain": None}
-    settings, sentence = chosen(**{**given, **plane})
-    alone = [
-        chosen(**{**given, "restitution": [alpha], "packing_fraction": [nu]})[0].timestep[0]
-        for alpha, nu in product(*plane.values())
-    ]
+    given = {**GOOD, **plane, "timestep": "auto", "grains": (64, 256), "strain": None}
+    settings, sentence = chosen(**given)
+    points = [dict(zip(plane, point, strict=True)) for point in product(*plane.values())]
+    alone = [chosen(**{**given, **point})[0].timestep[0] for point in points]
     assert settings.timestep == (min(alone),) and len({*alone}) > 1
     assert f"timestep {min(alone):g} / shear rate" in sentence
-    assert chosen(**{**given, **plane, "strain": 1e-3})[0].timestep[0] <= 1e-3 / 160
+    assert chosen(**{**given, "strain": 1e-3})[0].timestep[0] <= 1e-3 / 160
 
 
 def test_automatic_choices_are_finer_for_a_smaller_error() -> None:
@@ -104,12 +96,6 @@ def test_automatic_choices_are_finer_for_a_smaller_error() -> None:
     timesteps = [settings.timestep for settings, _ in found]
     assert timesteps == sorted(timesteps, reverse=True) and timesteps[-1] < timesteps[0]
     assert all("restitution 0.9 and packing fraction 0.6" in sentence for _, sentence in found)
-
-
-def test_a_single_number_is_a_plane_of_one_as_on_the_command_line() -> None:
-    for kind in (float, np.float64, np.array):
-        settings, _ = chosen(**{**GOOD, "restitution": kind(0.5), "packing_fraction": kind(0.7)})
-        assert (settings.restitution, settings.packing_fraction) == ((0.5,), (0.7,))
 
 
 def test_numbers_of_grains_may_be_given_by_point() -> None:
@@ -123,9 +109,6 @@ def test_numbers_of_grains_may_be_given_by_point() -> None:
 def test_a_given_tolerance_is_that_of_the_solver() -> None:
     settings, _ = chosen(**{**GOOD, "solver": Jacobi(relaxation=1.5), "tolerance": 1e-3})
     assert settings.solver == Jacobi(tolerance=1e-3, relaxation=1.5)
-    for value in (0.0, 1.0, "auto"):
-        with pytest.raises(InputError, match="tolerance must be between"):
-            chosen(**{**GOOD, "tolerance": value})
 
 
 def test_the_command_and_the_function_start_alike() -> None:
@@ -183,23 +166,15 @@ def test_strain_and_time_of_a_plan_are_those_that_maps_took() -> None:
     data = jg.open_map(RESULTS / "reference_check_small.nc")
     settings = MapSettings(**from_attrs(data))
     flows = list(settings.flows.values())
-    shape = len(flows), -1
-    strains = data["sums/strain"].values.reshape(shape)
-    prepared = data["sums/equilibration_strain"].values.reshape(shape)
+    alphas, sizes = np.array([(flow.restitution, flow.grains) for flow in flows]).T
+    strains = data["sums/strain"].values.reshape(len(flows), -1)
+    prepared = data["sums/equilibration_strain"].values.reshape(len(flows), -1)
     correlation = data.correlation_strain.values.ravel()
-    worst = np.max(
-        [
-            (data[f"{name}_stderr"] / data[name]).values.ravel()
-            for name in ("pressure", "shear_stress")
-        ],
-        axis=0,
-    )
-    alphas, sizes = (
-        np.array([getattr(flow, name) for flow in flows]) for name in ("restitution", "grains")
-    )
-    scatter = worst * np.sqrt(strains.sum(axis=1) / correlation)
-    ratios = scatter / expected_scatter(alphas, sizes)
-    assert 0.5 < np.exp(np.log(ratios).mean()) < 2 and np.exp(np.log(ratios).std()) < 2
+    names = "pressure", "shear_stress"
+    errors = [(data[f"{name}_stderr"] / data[name]).values.ravel() for name in names]
+    scatter = np.max(errors, axis=0) * np.sqrt(strains.sum(axis=1) / correlation)
+    logs = np.log(scatter / expected_scatter(alphas, sizes))
+    assert 0.5 < np.exp(logs.mean()) < 2 and np.exp(logs.std()) < 2
     assert 0.5 < np.median(prepared / correlation[:, None]) / PREPARED < 2
     cost = sum(
         (flow.grains / 1000) ** 0.2
@@ -211,14 +186,12 @@ def test_strain_and_time_of_a_plan_are_those_that_maps_took() -> None:
 
 
 @pytest.mark.parametrize(
-    "lists",
-    [np.linspace(0.1, 0.9, 9), np.linspace(0.1, 0.9, 9, dtype=np.float32), [np.float32(0.3), 0.5]],
-    ids=["float64", "float32", "mixed"],
+    "lists", [np.linspace(0.1, 0.9, 9), [np.float32(0.3), 0.5], np.float32(0.3)], ids=str
 )
 def test_the_numbers_of_an_axis_are_the_decimals_that_they_stand_for(lists: Any) -> None:
     """0.30000000000000004 would be another point, of other random numbers, than 0.3."""
     settings, _ = chosen(**{**GOOD, "restitution": lists, "timestep": 3 * (1e-3 / 10)})
-    assert settings.restitution == tuple(float(f"{x:.3g}") for x in lists)
+    assert settings.restitution == tuple(float(f"{x:.3g}") for x in np.atleast_1d(lists))
     assert 0.3 in {point.restitution for point in settings.points}
     assert settings.timestep == (3e-4,)
     with refused("without repetition"):

@@ -1,7 +1,5 @@
-"""Every task is done once, in the order of the list, and Ctrl-C ends all of them."""
+"""Every task is done once, and an error ends all of them."""
 
-import os
-import signal
 import subprocess
 import sys
 import threading
@@ -13,23 +11,6 @@ import jax.numpy as jnp
 import pytest
 
 from jaxgran.dynamics.batch import Cancelled, in_threads
-from jaxgran.maps.batches import replica_ids
-from jaxgran.maps.replica import Advance
-from jaxgran.maps.run import run_replicas
-from jaxgran.maps.settings import MapSettings
-
-SECOND = 1.0
-ENDLESS = MapSettings(
-    (0.7,), (0.6,), grains=32, seeds=2, timestep=1e-3, equilibrate=0.0, strain=1e5
-)
-
-
-@pytest.fixture
-def ctrl_c():
-    """Ctrl-C as a terminal has it: a shell ignores it for what it runs in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 30])
@@ -62,9 +43,7 @@ def test_threads_have_the_precision_of_the_caller() -> None:
             assert [found for _, found in in_threads(dtype, [()] * 2, 2, print)] == [expected] * 2
 
 
-def test_an_error_is_raised_with_its_traceback_and_the_other_tasks_end_at_their_next_message() -> (
-    None
-):
+def test_an_error_is_raised_with_its_traceback_and_ends_the_other_tasks() -> None:
     ends = []
 
     def task(number: int, send) -> None:
@@ -91,36 +70,11 @@ def test_the_threads_end_with_the_generator() -> None:
             time.sleep(0.01)
         return number
 
-    running, before = (
-        in_threads(task, [(0,), (1,), (2,)], 2, lambda _: None),
-        threading.active_count(),
-    )
+    before = threading.active_count()
+    running = in_threads(task, [(0,), (1,), (2,)], 2, lambda _: None)
     assert next(running) == (0, 0)
     running.close()
     assert threading.active_count() == before
-
-
-@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="no signals to a thread")
-def test_replicas_of_hours_end_within_a_second_of_ctrl_c(ctrl_c) -> None:
-    reported, sent = [], []
-
-    def interrupt() -> None:
-        sent.append(time.monotonic())
-        os.kill(os.getpid(), signal.SIGINT)
-
-    def report(advance: Advance) -> None:
-        reported.append(advance)
-        if len(reported) == 2:
-            threading.Timer(
-                0.3, interrupt
-            ).start()  # in the middle of a block, of which a replica has 32
-
-    with pytest.raises(KeyboardInterrupt):
-        list(run_replicas(ENDLESS, replica_ids(ENDLESS), workers=2, report=report))
-    assert time.monotonic() - sent[0] < SECOND
-    computing = time.process_time()
-    time.sleep(0.2)
-    assert time.process_time() - computing < 0.1  # nothing goes on beside
 
 
 def test_a_command_does_not_wait_for_a_thread_that_still_computes() -> None:

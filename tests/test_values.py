@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import one_sentence, random_tally, refused, sample_of_tally, snapshot_of
+from synthetic import random_tally, refused, sample_of_tally, snapshot_of
 
 import jaxgran as jg
 from jaxgran.model.checks import InputError
@@ -28,8 +28,9 @@ VALUES = {
     "State": SERIES.state,
     "Grains": SERIES.state.grains,
     "Snapshot": SERIES,
+    "Sample": SAMPLES,
+    "Tally": SAMPLES.tally,
 }
-VALUES |= {"Sample": SAMPLES, "Tally": SAMPLES.tally}
 INDEXED = ("ShearFlow", "State", "Snapshot", "Sample")
 
 
@@ -98,19 +99,14 @@ def test_dataset_of_a_sample_has_its_averages_errors_and_units(one: Sample) -> N
         np.testing.assert_array_equal(data[name], one.averages[name])
         np.testing.assert_array_equal(data[f"{name}_stderr"], errors[name])
         assert data[name].dims == (*axes, *row.axes)
-        assert (
-            data[name].attrs["long_name"] == row.meaning
-            and data[name].attrs.get("reduced_unit", "1") == row.unit
-        )
-        assert ("standard deviation" in data[f"{name}_stderr"].long_name) == row.extreme
+        assert data[name].long_name == row.meaning
+        assert data[name].attrs.get("reduced_unit", "1") == row.unit
     np.testing.assert_array_equal(data.strain, one.strain)
     for name in ("restitution", "packing_fraction", "timestep", "shear_rate"):
         np.testing.assert_array_equal(data[name], getattr(one.flow, name))
     assert data.attrs["version_jaxgran"] == jg.__version__ and "engine" in data.attrs
-    assert (
-        data.status.flag_meanings.split()[int(np.max(data.status))]
-        == Status(int(np.max(one.status))).name
-    )
+    worst = Status(int(np.max(one.status)))
+    assert data.status.flag_meanings.split()[int(np.max(data.status))] == worst.name
 
 
 def with_observed(observed: Any) -> Sample:
@@ -122,14 +118,13 @@ def test_dataset_of_a_sample_has_what_was_observed() -> None:
     sums = {"torque": rng.uniform(1, 2, (2, BLOCKS)), "fabric": rng.uniform(1, 2, (2, BLOCKS, 3))}
     samples = with_observed(sums)
     data = samples.to_dataset()
-    assert data.fabric.dims == ("replica", "fabric_dim_0") and samples[
-        0
-    ].to_dataset().fabric.dims == ("fabric_dim_0",)
+    assert data.fabric.dims == ("replica", "fabric_dim_0")
+    assert samples[0].to_dataset().fabric.dims == ("fabric_dim_0",)
     for name, x in sums.items():
         steps = SAMPLES.tally.steps.sum(axis=1).reshape(2, *[1] * (x.ndim - 2))
         np.testing.assert_allclose(data[name], x.sum(axis=1) / steps, rtol=1e-12)
         np.testing.assert_array_equal(data[f"{name}_stderr"][1], samples[1].observed()[1][name])
-    with pytest.raises(InputError, match="names that a sample does not have, not 'pressure'"):
+    with refused("names that a sample does not have, not 'pressure'"):
         with_observed({"pressure": sums["torque"]}).to_dataset()
 
 
@@ -141,8 +136,7 @@ def test_one_replica_of_states_that_share_their_grains_has_all_of_them() -> None
 
 
 def test_observed_tells_what_is_missing() -> None:
-    with pytest.raises(InputError, match="made without") as without:
+    with refused("made without"):
         SAMPLES[0].observed()
-    with pytest.raises(InputError, match=r"sample\[0\] of this batch") as of_batch:
+    with refused(r"sample\[0\] of this batch"):
         with_observed({"x": np.ones((2, BLOCKS))}).observed()
-    assert one_sentence(str(without.value)) and one_sentence(str(of_batch.value))
