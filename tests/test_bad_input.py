@@ -279,6 +279,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "timestep must be a positive number": lambda: make_flow("timestep", 0.0),
     "timestep must be at most 0.1 / shear_rate": lambda: make_flow("timestep", 0.2),
     "shear_rate must be 0 or between": lambda: make_flow("shear_rate", -1e-9),
+    "and 1e+100, not 1e+150": lambda: jg.ShearFlow(GRAINS, 0.5, 0.6, 1e-153, shear_rate=1e150),
     "between 1e-100 and 1e+100, not 1e-150": lambda: make_flow("shear_rate", 1e-150),
     "polydispersity must be between 0 and 0.5": lambda: make_flow("polydispersity", 0.51),
     "arrays of one shape": lambda: jg.ShearFlow(GRAINS, np.zeros(2), np.full(3, 0.5), 1e-3),
@@ -290,6 +291,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     # preparation, sample, snapshots
     "one ShearFlow, and this is a batch": lambda: jg.pack(BATCH, KEY),
     "numbers of the flow must be single ones or": lambda: jg.prepare(BATCH, KEY),
+    "grains must have the byte order of this": lambda: jg.pack(flow(), KEY, SWAPPED.grains),
     "state must have the byte order of this": lambda: jg.sample(flow(), SWAPPED, 1.0),
     "at least 2.3e-13 in float32, not 1e-20": lambda: jg.sample(SLOW, SINGLE, 1.0),
     "at most 2147483647 time steps": lambda: jg.sample(flow(), SEEN.state, 1e30),
@@ -297,6 +299,13 @@ REFUSED: dict[str, Callable[[], Any]] = {
     # a state
     "of velocities (32, 2), not (32, 3)": lambda: sheared(velocities=np.zeros((GRAINS, 3))),
     "only finite velocities": lambda: sheared(velocities=np.full((GRAINS, 2), np.nan)),
+    "of tilt (), not (1,)": lambda: sheared(tilt=np.zeros(1)),
+    "only finite tilt": lambda: sheared(tilt=np.float64(np.inf)),
+    "only positive and finite side": lambda: sheared(side=np.float64(np.nan)),
+    "only positive and finite masses": lambda: sheared(grains=jg.Grains(HALF, -HALF)),
+    "its numbers are int64": lambda: jg.sample(
+        flow(), jax.tree.map(lambda x: np.asarray(x, int), SEEN.state), 1.0
+    ),
     "only positive and finite radii": lambda: sheared(grains=jg.Grains(-HALF, HALF)),
     "grains 0 and 1 are 0 diameters apart": lambda: sheared(positions=PLACES[0, ::2].repeat(2, 0)),
     "no total momentum": lambda: sheared(velocities=np.ones((GRAINS, 2))),
