@@ -211,8 +211,9 @@ def test_ratio_map_warns_of_points_and_shows_progress(monkeypatch, capsys) -> No
 
     monkeypatch.setattr(ratio_map_module, "run_replicas", found)
     sentence = r"^1 of 2 points failed: deep overlap at \(restitution 0.5, packing fraction 0.6\)"
-    with pytest.warns(BadPoints, match=sentence):
+    with pytest.warns(BadPoints, match=sentence) as caught:
         ratio_map(**{**SETTINGS, "seeds": 1}, progress=True)
+    assert caught[0].filename == __file__  # of the call
     assert "2/2 points" in capsys.readouterr().err
 
 

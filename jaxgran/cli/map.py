@@ -87,11 +87,12 @@ def require_new_figures(output: Path, format: FileFormat) -> None:
                 name for name in os.listdir(output.parent) if name.startswith(f"{output.stem}_")
             ]
     if names:
-        from jaxgran.plotting.map_figures import FIGURES
+        from jaxgran.plotting.map_figures import FIGURES, figure_path
 
-        for name in sorted({f"{output.stem}_{figure}.{format}" for figure in FIGURES} & {*names}):
+        figures = (figure_path(output.with_suffix(""), name, format) for name in FIGURES)
+        for figure in sorted(path for path in figures if path.name in names):
             raise InputError(
-                f"the figure {short_repr(str(output.with_name(name)))} already exists; name "
+                f"the figure {short_repr(str(figure))} already exists; name "
                 "another output, or pass `overwrite=True` to replace it.",
                 field="output",
             )

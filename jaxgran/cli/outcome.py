@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxgran.cli.options import with_options
+from jaxgran.cli.summary import relative_error, summary_of
 from jaxgran.cli.terminal import (
     BAD_STATUS,
     configured_jax,
@@ -104,12 +105,12 @@ def _stamp(path: Path | None) -> tuple[int, int] | None:
 
 def _say_errors(data) -> None:
     """Print the largest relative error beside the requested one, and the sampled strains."""
-    from jaxgran.maps.schema import relative_ci95
     from jaxgran.sampling.sample import ERROR_OBSERVABLES
 
     if "error" not in data.attrs:
         return
-    errors = np.stack([relative_ci95(data, name)["total"] for name in ERROR_OBSERVABLES])
+    summary = summary_of(data)
+    errors = np.stack([relative_error(summary, name) for name in ERROR_OBSERVABLES])
     known = np.isfinite(errors).all(axis=0)
     if not known.any():
         return

@@ -197,6 +197,13 @@ def _print_success_of_theory(summary: Summary) -> None:
         print_text(f"{words} {right} of {counted(known, 'point')}.")
 
 
+def relative_error(summary: Summary, name: str) -> np.ndarray:
+    """Half-width of the 95 % interval of an average of a large system over the average."""
+    large = summary[f"{name}_large_system"]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return large.ci95 / np.abs(large.value)
+
+
 def _has_values(summary: Summary) -> bool:
     return bool(np.isfinite(summary["force_ratio"].value).any())
 
@@ -245,7 +252,8 @@ def _print_large_system(summary: Summary, polydispersity: float | None) -> None:
     predicted, rows = _predicted(summary) if is_point else {}, []
     for name, words in _LARGE.items():
         large = summary[f"{name}_large_system"]
-        sources = {x: _percent(large.ci95_by_source[x] / abs(large.value)) for x in _SOURCES}
+        with np.errstate(invalid="ignore", divide="ignore"):
+            sources = {x: _percent(large.ci95_by_source[x] / abs(large.value)) for x in _SOURCES}
         sources |= {"timestep": ("–", "–")} if name == "force_ratio" else {}
         medians, largest = zip(*sources.values(), strict=True)
         if is_point:
@@ -254,7 +262,7 @@ def _print_large_system(summary: Summary, polydispersity: float | None) -> None:
             continue
         both = (
             _percent(large.value / summary[name].value - 1),
-            _percent(large.ci95 / abs(large.value)),
+            _percent(relative_error(summary, name)),
         )
         rows += [[words, *(x[0] for x in both), *medians]]
         rows += [["  largest", *(x[1] for x in both), *largest]]

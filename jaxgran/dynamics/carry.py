@@ -36,7 +36,7 @@ class Carry(NamedTuple):
 
     lists: PairLists
     pairs: PairMotion  # of the near list
-    slack: Float[Array, ""]  # of the near list, see the module
+    slack: Float[Array, ""]  # of the near list, see ``step``
     closing_speed: Float[Array, ""]  # bound on how fast any gap closes
     velocities: Float[Array, "grains 2"]
     step: Int[Array, ""]  # steps flown

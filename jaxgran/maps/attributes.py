@@ -117,13 +117,12 @@ def identity(settings: MapSettings | Mapping[str, Any]) -> dict[str, Any]:
     return json.loads(json.dumps(values, default=lambda number: number.item()))
 
 
-def identity_of_replicas(settings: MapSettings | Mapping[str, Any]) -> dict[str, Any]:
-    """The part of ``identity`` that all replicas of a map have in common: all but its axes, its
+def common_identity(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The part of an ``identity`` that all replicas of a map have in common: all but its axes, its
     seeds and its part.
 
     With an ``error`` the number of seeds remains, as the sampled strain depends on it.
     """
-    values = identity(settings)
     apart = {
         *AXES,
         "grains_by_point",

@@ -10,7 +10,7 @@ import jax
 import xarray as xr
 
 from jaxgran.contact.projected_methods import ProjectedMethod, solver_text
-from jaxgran.maps.attributes import first_difference, from_attrs, identity_of_replicas
+from jaxgran.maps.attributes import common_identity, first_difference, from_attrs, identity
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.own_observables import identity_of
 from jaxgran.maps.provenance import DECIDING
@@ -75,7 +75,7 @@ def merge_maps(
     chosen = [from_attrs(data) for data in opened]
     _require_same(names, chosen, opened)
     method: Any = chosen[0]["solver"] if solver is None else solver
-    text = identity_of_replicas(chosen[0])["solver"]
+    text = identity(chosen[0])["solver"]
     if isinstance(method, str) or solver_text(method) != text:  # a text is that of a user's class
         raise InputError(f"solver must be that of the maps, which is {text}.")
     given = {"observe": observe, "solver": method}
@@ -92,7 +92,7 @@ def _require_same(
     compared = []
     for settings, data in zip(chosen, maps, strict=True):
         of_run = {name: data.attrs.get(name) for name in _EQUAL}
-        compared.append(identity_of_replicas(settings) | of_run)
+        compared.append(common_identity(identity(settings)) | of_run)
         if any("grains_by_point" in parameters for parameters in chosen):
             compared[-1] |= {name: settings.get(name) for name in (*AXES, "grains_by_point")}
     for name, values in zip(names, compared, strict=True):

@@ -303,6 +303,6 @@ def _warn_of_bad_points(data: xr.DataTree) -> None:
     bad.pop("failed", None)  # batches that were given up have had a warning of their own
     short_samples = bad.pop("short_sample", [])
     if short_samples:
-        warnings.warn(short_samples_message(data, short_samples), BadPoints, stacklevel=4)
+        warnings.warn(short_samples_message(data, short_samples), BadPoints, stacklevel=3)
     if bad:
-        warnings.warn(bad_points_message(data, bad), BadPoints, stacklevel=4)
+        warnings.warn(bad_points_message(data, bad), BadPoints, stacklevel=3)

@@ -50,16 +50,19 @@ def replica_of(
     replica: ReplicaId,
     sums: Mapping[str, np.ndarray],
     dtype: np.dtype,
+    own_sums: Mapping[str, jax.ShapeDtypeStruct] | None,
     state: State | None = None,
 ) -> Replica:
-    """The replica of ``sums_of``, in a map of these settings but for its axes and seeds."""
+    """The replica of ``sums_of``, in a map of these settings but for its axes and seeds, with
+    ``own_sums`` of ``sums_by_name``.
+    """
     status = int(sums["status"])
     if not np.isfinite(sums.get("area", np.nan)):
         return Replica(replica, None, status, np.nan)
     flow = jax.tree.map(dtype.type, settings.flow_at(replica.point))
-    area, shapes = float(sums["area"]), sums_by_name(settings)
+    area = float(sums["area"])
     sample = Sample(
-        tally_from_flat(sums["tally"], dtype, shapes),
+        tally_from_flat(sums["tally"], dtype, own_sums),
         dtype.type(area),
         dtype.type(mass_of_grains(flow.packing_fraction, area)),
         flow,
@@ -73,15 +76,18 @@ def measured_ids(data: xr.DataTree) -> dict[ReplicaId, tuple[int, ...]]:
     Raises:
       InputError: (a ValueError) the data have no sums.
     """
-    whole = _with_all_axes(data)
+    return _places(_with_all_axes(data), int(data.attrs["first_seed"]))
+
+
+def _places(whole: xr.Dataset, first_seed: int) -> dict[ReplicaId, tuple[int, ...]]:
     coords = [[rounded(x) for x in whole[name].values.tolist()] for name in AXES]
     sizes = whole["point_grains"].values[0] if "point_grains" in whole else None
-    first, ids = int(data.attrs["first_seed"]), {}
+    ids = {}
     for place in map(tuple, np.argwhere(np.isfinite(whole["sums/area"].values)).tolist()):
         grains, dt, nu, alpha = (axis[k] for axis, k in zip(coords, place[:-1], strict=True))
         if sizes is not None:
             grains = sizes[place[1:-1]]
-        ids[ReplicaId(int(grains), dt, nu, alpha, first + place[-1])] = place
+        ids[ReplicaId(int(grains), dt, nu, alpha, first_seed + place[-1])] = place
     return ids
 
 
@@ -101,7 +107,7 @@ def replicas_of(data: xr.DataTree, settings: MapSettings) -> Iterator[Replica]:
     fields = [f"states/{name}" for name in FIELDS if f"states/{name}" in whole]
     states = {path.partition("/")[2]: whole[path].values for path in fields}
     kept = set()
-    for replica, place in measured_ids(data).items():
+    for replica, place in _places(whole, int(data.attrs["first_seed"])).items():
         sums = {name: array[place] for name, array in arrays.items()}
         name = names[int(sums["status"])]
         sums["status"] = np.asarray(Status[name] if name in Status.__members__ else NOT_RUN)
@@ -109,7 +115,7 @@ def replicas_of(data: xr.DataTree, settings: MapSettings) -> Iterator[Replica]:
         if states and replica.point not in kept and sums["status"] < GIVEN_UP:
             kept.add(replica.point)  # the state is that of the first good seed
             state = state_of({name: x[place[:-1]] for name, x in states.items()}, dtype)
-        yield replica_of(settings, replica, sums, dtype, state)
+        yield replica_of(settings, replica, sums, dtype, own_sums, state)
 
 
 def _with_all_axes(data: xr.DataTree) -> xr.Dataset:

@@ -145,16 +145,6 @@ def flag_names(flags: xr.DataArray) -> dict[int, str]:
     return dict(zip(values, flags.attrs["flag_meanings"].split(), strict=True))
 
 
-def relative_ci95(data: MapData, name: str) -> dict[str, np.ndarray]:
-    """Half-width of the 95 % interval of an average of a large system over the average, at every
-    point, by the source of the error.
-    """
-    large = flattened(data)[[f"{name}_large_system", f"{name}_large_system_ci95"]]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = large[f"{name}_large_system_ci95"] / np.abs(large[f"{name}_large_system"])
-    return {source: share.sel(error_source=source).values for source in ERROR_SOURCES}
-
-
 def shear_stress_ratio(data: MapData) -> tuple[xr.DataArray, xr.DataArray]:
     """Contact over binary shear stress, and its standard error: component xy of the ratio of the
     stresses.

@@ -25,15 +25,15 @@ def state_values(states: Sequence[State | None]) -> dict[str, np.ndarray]:
     """The fields of the states of points, by name; NaN for points without one, and after the last
     grain.
     """
-    grains = max((len(x.grains.radii) for x in states if x is not None), default=0)
+    known = {point: values_of(state) for point, state in enumerate(states) if state is not None}
+    grains = max((len(values["radii"]) for values in known.values()), default=0)
     columns = {}
     for name in FIELDS:
         shape = (grains, *_OF_GRAINS[name]) if name in _OF_GRAINS else ()
         column = columns[name] = np.full((len(states), *shape), np.nan)
-        for point, state in enumerate(states):
-            if state is not None:
-                part = values_of(state)[name]
-                column[(point, slice(len(part))) if shape else point] = part
+        for point, values in known.items():
+            part = values[name]
+            column[(point, slice(len(part))) if shape else point] = part
     return columns
 
 

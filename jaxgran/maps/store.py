@@ -36,13 +36,14 @@ from jaxgran.files import atomic_write, is_locked, lock_file
 from jaxgran.io.arrays import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps import results
 from jaxgran.maps.attributes import (
+    common_identity,
     digest,
     first_difference,
     from_attrs,
     identity,
-    identity_of_replicas,
 )
 from jaxgran.maps.batches import replica_ids
+from jaxgran.maps.own_observables import sums_by_name
 from jaxgran.maps.provenance import code_name, deciding, made_with
 from jaxgran.maps.replica import Replica, ReplicaId, union
 from jaxgran.maps.rows import measured_ids, replica_of, replicas_of, sums_of
@@ -76,9 +77,9 @@ class Store:
         self.damaged: list[str] = []
         self._lock_path, self._begun_path = self.folder / "lock", self.folder / "settings.json"
         self._ids = set(replica_ids(settings))
-        made = made_with()
+        self._made, self._of_map = made_with(), identity(settings)
         of_device = {"device": default_device().platform, "number of running sums": len(TABLE)}
-        self._identity = identity_of_replicas(settings) | deciding(made) | of_device
+        self._identity = common_identity(self._of_map) | deciding(self._made) | of_device
         self._digest = digest(self._identity)
         self.in_file: set[ReplicaId] = set()
         earlier = self._earlier_map(resume, overwrite) if output.exists() else None
@@ -148,13 +149,13 @@ class Store:
         """The map of the file, if its replicas are to be taken."""
         try:
             data = results.open_map(self.output)
-            there, self.in_file = from_attrs(data), set(measured_ids(data))
+            there, self.in_file = identity(from_attrs(data)), set(measured_ids(data))
         except InputError:
             if not overwrite:
                 raise self._refused("something other than a map of this version") from None
             return None
-        difference = first_difference(identity(there), identity(self.settings))
-        same = identity_of_replicas(there) == identity_of_replicas(self.settings)
+        difference = first_difference(there, self._of_map)
+        same = common_identity(there) == common_identity(self._of_map)
         if resume and same:
             return self._of_same_code(data, overwrite)
         if overwrite:
@@ -175,8 +176,8 @@ class Store:
         """A map whose numbers this process would repeat; None for another one that may be
         replaced.
         """
-        here, there = made_with(), {str(name): str(value) for name, value in data.attrs.items()}
-        difference = first_difference(deciding(here), deciding(there))
+        there = {str(name): str(value) for name, value in data.attrs.items()}
+        difference = first_difference(deciding(self._made), deciding(there))
         if difference is None:
             return data
         if overwrite:
@@ -184,7 +185,7 @@ class Store:
         name, now, before = difference
         raise InputError(
             f"output {short_repr(str(self.output))} was made with {code_name(there)}, and this is "
-            f"{code_name(here)}: it has {name} {before!r}, not {now!r}; draw it as it is by "
+            f"{code_name(self._made)}: it has {name} {before!r}, not {now!r}; draw it as it is by "
             "jaxgran plot, or pass `overwrite=True` to measure it again.",
             field="output",
         )
@@ -229,18 +230,18 @@ class Store:
             )
         if difference := first_difference(self._identity, begun):
             name, requested, begun_with = difference
-            here = made_with()
             by, where = "", "with the same parameters"
-            if name in here:
+            if name in self._made:
                 other = code_name({key: str(text) for key, text in (begun | commit).items()})
-                by, where = f" was begun by {other}, and this is {code_name(here)}: it", "there"
+                here = code_name(self._made)
+                by, where = f" was begun by {other}, and this is {here}: it", "there"
             raise InputError(
                 f"the unfinished map in {str(self.folder)!r}{by} has {name} {begun_with!r}, not "
                 f"{requested!r}; resume it {where}, or name another `output`."
             )
 
     def _write_begun(self) -> None:
-        content = json.dumps(self._identity | {"commit": made_with()["commit"]})
+        content = json.dumps(self._identity | {"commit": self._made["commit"]})
         with atomic_write(self._begun_path) as temporary:
             temporary.write_text(content, "utf-8")
 
@@ -255,7 +256,7 @@ class Store:
 
     def _read(self) -> Iterator[Replica]:
         """The replicas of the folder, also those of other axes and seeds."""
-        dtype = np.dtype(precision())
+        dtype, own_sums = np.dtype(precision()), sums_by_name(self.settings)
         for path in sorted(self.folder.glob("replica-*.npz")):
             try:
                 arrays, about = read_arrays(path)
@@ -266,7 +267,7 @@ class Store:
             fields = {x[6:]: array for x, array in arrays.items() if x.startswith("state_")}
             state = jax.tree.map(np.asarray, state_of(fields, dtype)) if fields else None
             replica: Any = about["replica"]
-            yield replica_of(self.settings, ReplicaId(*replica), arrays, dtype, state)
+            yield replica_of(self.settings, ReplicaId(*replica), arrays, dtype, own_sums, state)
 
     def _new_lock(self) -> int | None:
         """The lock of the folder, made if missing; InputError if another process has it."""

@@ -122,9 +122,9 @@ def digest_of(observe: Observe, flow: ShearFlow) -> str:
     def without(state: State) -> Any:
         return without_contacts(observe_at(observe, flow, state), state.positions.dtype)
 
-    program = jax.jit(without).lower(_abstract_state(flow.grains)).as_text()
-    results = jax.tree.structure(jax.eval_shape(without, _abstract_state(flow.grains)))
-    return hashlib.sha256(f"{program} {results}".encode()).hexdigest()[:16]
+    program = jax.jit(without).lower(_abstract_state(flow.grains))
+    text = f"{program.as_text()} {program.out_tree}"
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _abstract_state(grains: int) -> State:
