@@ -198,8 +198,9 @@ BENCHMARKS = (
     Benchmark(
         "stability",
         "Where do methods fail, from loose and elastic to dense and dissipative flows?",
-        (30, 2),
+        (150, 2),
         ("stability.json", "stability.png"),
+        (Option("--folder", "where the flows that are done are kept", Path),),
         one_core=True,
     ),
 )

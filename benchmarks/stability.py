@@ -1,80 +1,106 @@
-"""Where methods fail: seven ways to shear the same discs, over ten flows.
+"""Where methods fail: pressure, shear stress and force ratio of many flows by many methods, with
+what the program itself says of them.
 
-The flows go from loose and nearly elastic to dense and dissipative, and to a jammed one. Each
-method has one setting that trades time for accuracy: the time step dt of contact dynamics, the
-stiffness k of soft discs; event-driven discs have none. From the same steady states, three seeds of
-256 discs, every setting is sheared on, and pressure and shear stress are compared with a reference:
-the default at dt = 1e-4 and a tolerance of 1e-6. A cell of the figure is the coarsest setting that
-is right: both stresses within 5 % and one standard error, of one to three per cent, there and at
-the next finer setting, with which the search ends. Where none is, a word says what happened at the
-finest setting (``OUTCOMES``).
+The flows go from loose and nearly elastic to dense, dissipative and jammed ones, and one dense flow
+is repeated with few grains, many grains and a mass ratio of 100. Every method shears the same three
+steady states on until the standard errors of pressure and shear stress are at most ``PRECISION``,
+that of the reference included, or until one of them is wrong beyond doubt, or until its time is up
+(``SECONDS``). One criterion holds: an average is right if it is within ``RIGHT`` of the reference.
+The reference is the Gauss–Seidel loop of ``independent.contact_dynamics``, which shares no code
+with jaxgran, at a time step and a tolerance far below those of the methods. For the force ratio,
+which depends on the time step in dense flows, its time step is shorter still.
 
-Contact dynamics is stopped by the first block of strain that fails: a solve above the tolerance, no
-impulses, too many contacts, a number that is not finite, or energy that was gained, which is a
-negative dissipation, or kinetic energy beyond the shear work less the dissipation. It is stopped,
-too, where it takes more than ``SLOW``. A setting is silent if it is wrong without any of these, and
-without deep overlaps.
+Beside each error stands the status that ``jg.sample`` gives such a sample. What is wrong without a
+status is a silent error; soft discs have no status, and so all their errors are silent.
 
-    python -m benchmarks stability            # about half an hour on two cores
+    python -m benchmarks stability            # about two hours on two cores
     python -m benchmarks stability --quick    # two flows of 64 grains, about two minutes
 """
 
+import json
+import math
 import multiprocessing
 import time
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Patch, Rectangle
 
 import jaxgran as jg
 from benchmarks.output import Output
-from benchmarks.peers import event_driven, lammps
+from benchmarks.peers import event_driven, lammps, numba_rival
 from benchmarks.peers.jaxgran_itself import discs_of
-from benchmarks.peers.problem import Flow, Stress, blocks_of, relative
-from benchmarks.peers.problem import averages as stress_means
-from jaxgran.dynamics.batch import stack
+from benchmarks.peers.problem import Flow, Run, Stress, averages, relative
 from jaxgran.environment import usable_cores
-from jaxgran.model.choices import MAX_PACKING_FRACTION
-from jaxgran.model.status import DEEP_OVERLAP
 from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, empty_figure, styled
-from jaxgran.sampling.averages import averages
-from jaxgran.sampling.prediction import predicted
-from jaxgran.sampling.timestep import expected_temperature, longest_timestep
+from jaxgran.sampling.averages import averages as averages_of_sums
+from jaxgran.sampling.timestep import DEEPEST_OVERLAP, mean_gap
 
-JAMMED = 0.84
-FLOWS = (
-    *((0.95, 0.3), (0.9, 0.7), (0.9, 0.8), (0.5, 0.5), (0.5, 0.7)),
-    *((0.5, 0.8), (0.1, 0.5), (0.1, 0.7), (0.1, 0.8), (0.5, JAMMED)),
-)
-TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4)
-STIFFNESSES = (1e3, 1e4, 1e5, 1e6, 1e7)
-SOFT = "soft discs, LAMMPS"
-RIGHT = 0.05  # relative error of pressure and shear stress, and a standard error
+RIGHT = 0.05  # relative error of an average
+PRECISION = 0.01  # relative standard error, that of the reference included
+REFERENCE_PRECISION = 0.006  # that of the reference alone
+DOUBT = 4.0  # standard errors beyond ``RIGHT`` after which a sample may end
+SECONDS = 150.0  # of processor time, for all seeds of a method
+REFERENCE_SECONDS = 600.0
 STRESSES = ("pressure", "shear_stress")
-SLOW = 5e-3  # s of processor time for a grain and a unit of strain; the default takes 0.15 ms
-GAIN = {"float64": 1e-6, "float32": 1e-3}  # of the energies exchanged, which rounding explains
-OUTCOMES = {  # mildest first, with the word in a cell
-    "ok": "right",
-    "no_reference": "–",  # it runs, and there is nothing to compare with
-    "too_slow": "too slow",
-    "too_soft": "too soft",
-    "silent": "silent",  # wrong, and no status says so
-    "iteration_limit": "unsolved",  # solves end above the tolerance
-    "deep_overlap": "overlaps",
-    "infeasible": "jammed",  # no impulses exist
-    "energy_gain": "energy",  # is gained
-    "capacity": "capacity",  # more contacts than the buffers hold
-    "nonfinite": "not finite",
-    "collapse": "collapse",
-    "gives_up": "gives up",
-}
+JAMMED = 0.84
+
+
+@dataclass(frozen=True)
+class Case:
+    """A flow, its grains, and the ratio of the largest to the smallest mass where masses do not
+    follow from the diameters.
+    """
+
+    restitution: float
+    packing_fraction: float
+    grains: int = 256
+    mass_ratio: float | None = None
+
+    @property
+    def block(self) -> float:
+        """Strain of a block, in which a flow of any size scatters about as much."""
+        return min(20.0, max(1.0, 5 * 256 / self.grains))
+
+
+class Plan(NamedTuple):
+    """Flows, seeds, and the fewest blocks of each."""
+
+    cases: tuple[Case, ...]
+    seeds: int
+    fewest: int
+
+
+FULL = Plan(
+    tuple(
+        Case(*values)
+        for values in (
+            *((0.95, 0.3), (0.9, 0.7), (0.9, 0.8), (0.5, 0.5), (0.5, 0.7), (0.5, 0.8)),
+            *((0.5, 0.82), (0.5, 0.83), (0.5, JAMMED), (0.1, 0.5), (0.1, 0.7), (0.1, 0.8)),
+            *((0.5, 0.8, 64), (0.5, 0.8, 4096), (0.5, 0.8, 256, 100.0)),
+        )
+    ),
+    3,
+    8,
+)
+QUICK = Plan((Case(0.8, 0.6, 64), Case(0.5, JAMMED, 64)), 2, 4)
+TRANSIENT = 5.0  # strain that is left out, in which a flow takes on the errors of a method
+PARTS = 12  # of the first block, each as long as all before it, so that what fails ends early
+TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4)
+TIMESTEP = 1e-3  # of the other solvers and engines
+REFERENCE_TIMESTEP, FORCE_TIMESTEP = 3e-5, 1e-5
+STIFFNESSES = (1e5, 1e6, 1e7)
+
+advance = jax.jit(jg.advance, static_argnames="engine")
+pack = jax.jit(jg.pack)
 
 
 @dataclass(frozen=True)
@@ -87,156 +113,233 @@ class JacobiDiagonal(jg.Jacobi):
         return operator.diagonal()
 
 
-METHODS: dict[str, dict[str, Any]] = {  # of contact dynamics
-    "single precision": {"dtype": "float32"},
-    "Jacobi, diag W": {"solver": JacobiDiagonal(relaxation=1.0)},
-    "Jacobi, bound of W": {"solver": jg.Jacobi()},
-    "Nesterov": {"solver": jg.Nesterov()},
-    "default": {},
+DEFAULT, EVENT_DRIVEN, SOFT = "default", "event-driven", "soft discs, LAMMPS"
+METHODS: dict[str, tuple[tuple[float, ...], dict[str, Any]]] = {  # of contact dynamics
+    DEFAULT: (TIMESTEPS, {}),
+    "JAX engine": ((TIMESTEP,), {"engine": jg.Jax()}),
+    "single precision": ((TIMESTEP,), {"dtype": "float32"}),
+    "Nesterov": ((TIMESTEP,), {"solver": jg.Nesterov()}),
+    "Jacobi, bound of W": ((TIMESTEP,), {"solver": jg.Jacobi()}),
+    "Jacobi, diag W": ((TIMESTEP,), {"solver": JacobiDiagonal(relaxation=1.0)}),
 }
-PEERS = {
-    "event-driven": (event_driven, (0.0,)),
-    SOFT: (lammps, STIFFNESSES),
-}
+PEERS = {EVENT_DRIVEN: ((0.0,), event_driven), SOFT: (STIFFNESSES, lammps)}
 
 
-class Plan(NamedTuple):
-    """Flows as (restitution, packing fraction), grains, seeds, blocks of each sample and the strain
-    of each, and the time steps.
+class Failure(Exception):
+    """The word for what ended a run."""
+
+
+def run(output: Output, folder: Path | None = None) -> None:
+    """Measure all flows on all cores, print what is found, and write JSON and PNG.
+
+    Flows that are done are kept in the folder, for a second run of the same commit.
     """
-
-    flows: tuple[tuple[float, float], ...]
-    grains: int
-    seeds: int
-    blocks: int
-    strain: float
-    timesteps: tuple[float, ...]
-
-
-FULL = Plan(FLOWS, 256, 3, 6, 5.0, TIMESTEPS)
-PARTS = 12  # of the first block of a seed
-QUICK = Plan(((0.8, 0.6), (0.5, JAMMED)), 64, 2, 4, 1.0, (1e-2, 1e-3))
-REFERENCE_TIMESTEP, REFERENCE_TOLERANCE, REFERENCE_BLOCKS = 1e-4, 1e-6, 3  # times the blocks
-
-advance = jax.jit(jg.advance)
-pack = jax.jit(jg.pack)
-
-
-def run(output: Output) -> None:
-    """Measure all flows on all cores, print what fails, and write JSON and PNG."""
-    plan, rows = QUICK if output.quick else FULL, []
+    plan = QUICK if output.quick else FULL
+    folder = folder or output.path(".stability", "")
+    folder.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
-        dense_first = sorted(plan.flows, key=lambda flow: -flow[1])
-        for future in as_completed(pool.submit(rows_of_flow, plan, flow) for flow in dense_first):
-            rows += future.result()
-    rows.sort(key=lambda row: plan.flows.index((row["alpha"], row["nu"])))
-    head = {**plan._asdict(), "right": RIGHT, "missing": lammps.missing()}
+        dense_first = sorted(plan.cases, key=lambda case: -case.packing_fraction)
+        done = {
+            case: pool.submit(kept, folder / f"{case}.json", output.hardware, plan, case)
+            for case in dense_first
+        }
+        results = [done[case].result() for case in plan.cases]
+    head = {
+        "seeds": plan.seeds,
+        "right": RIGHT,
+        "precision": PRECISION,
+        "seconds": SECONDS,
+        "timesteps_of_reference": {"stresses": REFERENCE_TIMESTEP, "force_ratio": FORCE_TIMESTEP},
+        "missing": lammps.missing(),
+        "references": [reference for reference, _ in results],
+    }
+    rows = [row for _, some in results for row in some]
     output.write_rows("stability", head, "rows", rows)
     output.write_picture(draw(rows), "stability")
 
 
-def rows_of_flow(plan: Plan, flow: tuple[float, float]) -> list[dict]:
-    """What becomes of a flow by every method and setting.
+def kept(path: Path, hardware: dict, plan: Plan, case: Case) -> tuple[dict, list[dict]]:
+    """``rows_of`` a flow, from its file where it is of the same commit and machine."""
+    if path.exists() and (known := json.loads(path.read_text()))["hardware"] == hardware:
+        return known["reference"], known["rows"]
+    found, rows = rows_of(plan, case)
+    path.write_text(json.dumps({"hardware": hardware, "reference": found, "rows": rows}))
+    return found, rows
 
-    ===================  ====  ==================================================================
-    key                  unit  meaning
-    ===================  ====  ==================================================================
-    alpha, nu            –     where
-    method, setting      –     a key of ``METHODS`` or ``PEERS``; its dt in 1/γ̇ or k in mγ̇²
-    outcome, detail      –     how the run ended, a key of ``OUTCOMES``, and the words of a peer
-    strain               –     that was sampled, over all seeds
-    errors               –     relative errors of pressure and shear stress with standard errors,
-                               None where nothing was sampled or nothing is right
-    largest_overlap      σ     of a contact, by contact dynamics
-    ===================  ====  ==================================================================
+
+def case_of(row: dict) -> Case:
+    return Case(*(row[name] for name in Case.__dataclass_fields__))
+
+
+def rows_of(plan: Plan, case: Case) -> tuple[dict, list[dict]]:
+    """The reference of a flow, and what becomes of it by every method and setting.
+
+    =================  ====  ====================================================================
+    key                unit  meaning
+    =================  ====  ====================================================================
+    fields of ``Case``       where
+    method, setting    –     a key of ``METHODS`` or ``PEERS``; its dt in 1/γ̇ or k in mγ̇²
+    failure            –     what ended the run: a status, "too_slow", or the words of a peer
+    status             –     of the sample, as ``jg.sample`` gives it; None by other programs
+    strain             –     that was sampled, over all seeds
+    seconds            s     of processor time
+    largest_overlap    σ     of a contact, by contact dynamics, and the mean in ``mean_overlap``
+    pressure, …        –     relative error with its standard error, None where nothing was sampled
+    =================  ====  ====================================================================
     """
-    alpha, nu = flow
-    states = [start(plan.grains, alpha, nu, seed) for seed in range(plan.seeds)]
-    solver = jg.BarzilaiBorwein(tolerance=REFERENCE_TOLERANCE)
-    longer = plan._replace(blocks=REFERENCE_BLOCKS * plan.blocks)
-    reference = None
-    if nu != JAMMED:
-        stresses, _ = sheared(longer, flow, states, REFERENCE_TIMESTEP, solver, limit=np.inf)
-        reference = stress_means([stresses])
-    ways = {
-        method: (settings, partial(by_peer, peer, plan, flow, states))
-        for method, (peer, settings) in PEERS.items()
-        if not peer.missing()
-    } | {
-        method: (plan.timesteps, partial(sheared, plan, flow, states, **chosen))
-        for method, chosen in METHODS.items()
-    }
+    states = [start(case, seed) for seed in range(plan.seeds)]
+    right = None if case.packing_fraction == JAMMED else reference(plan, case, states)
     rows = []
-    for method, (settings, way) in ways.items():
-        verdicts = []
-        for setting in settings:
-            stresses, how = way(setting)
-            row = {"alpha": alpha, "nu": nu, "method": method, "setting": setting, **how}
-            row |= {
-                "strain": len(stresses) * plan.strain,
-                "errors": relative_errors(stresses, reference),
-            }
-            rows.append(row)
-            verdicts.append(verdict(row))
-            print(
-                f"α = {alpha:g}, ν = {nu:g}  {method:20s}{setting:8.0e}  {verdicts[-1]:16s}"
-                + "".join(f"{100 * e:8.1f} ± {100 * s:.1f} %" for e, s in row["errors"] or []),
-                flush=True,
+
+    def measure(method: str, setting: float, begin: Callable[[jg.State], Run]) -> None:
+        row = {**asdict(case), "method": method, "setting": setting}
+        row |= measured(plan, case, [partial(begin, state) for state in states], right)
+        rows.append(row)
+        print(
+            f"{case}  {method:20s}{setting:8.0e}  {row['failure'] or row['status'] or '':16.16s}"
+            + "".join(
+                "{:8.1f} ± {:.1f} %".format(*(100 * x for x in row[name]))
+                for name in (*STRESSES, "force_ratio")
+                if row.get(name)
             )
-            if verdicts[-2:] == ["ok", "ok"]:
-                break
-    return rows
+            + f"  {row['largest_overlap'] or 0:.2g} σ, strain {row['strain']:.0f}"
+            + f", {row['seconds']:.0f} s",
+            flush=True,
+        )
+
+    for method, (settings, chosen) in METHODS.items():
+        for setting in settings:
+            measure(method, setting, partial(ContactDynamics, case, timestep=setting, **chosen))
+    for method, (settings, peer) in PEERS.items():
+        for setting in settings if not peer.missing() else ():
+            measure(method, setting, partial(peer_run, peer, case, setting))
+    return {**asdict(case), **(right or {})}, rows
 
 
-def relative_errors(
-    stresses: list[Stress], reference: dict[str, tuple[float, float]] | None
-) -> list[tuple[float, float]] | None:
-    """Errors of the stresses of some blocks with standard errors, relative to a reference; None
-    without either.
+def reference(plan: Plan, case: Case, states: Sequence[jg.State]) -> dict[str, tuple[float, float]]:
+    """Pressure, shear stress and force ratio by the loop, with standard errors."""
+    found = {}
+    for timestep, names in ((REFERENCE_TIMESTEP, STRESSES), (FORCE_TIMESTEP, ("force_ratio",))):
+        flow = Flow(case.restitution, case.packing_fraction)
+        runs = [
+            numba_rival.begin(discs_of(state), flow, "reference", timestep, case.block)
+            for state in states
+        ]
+        _warm_up(runs, case)
+
+        def precise(values: dict, names: tuple[str, ...] = names) -> bool:
+            return all(values[x][1] <= REFERENCE_PRECISION * abs(values[x][0]) for x in names)
+
+        blocks, seconds = _sampled(plan, runs, precise, REFERENCE_SECONDS)
+        values = averages(blocks)
+        found |= {name: values[name] for name in names}
+        strain = case.block * sum(map(len, blocks))
+        print(
+            f"{case}  reference {timestep:g}",
+            *(f"{name} {found[name][0]:.4g} ± {found[name][1]:.2g}" for name in names),
+            f"strain {strain:.0f}, {seconds:.0f} s",
+            flush=True,
+        )
+    return found
+
+
+def measured(
+    plan: Plan, case: Case, begins: Sequence[Callable[[], Run]], right: dict | None
+) -> dict[str, Any]:
+    """What a method makes of a flow: the keys of a row from ``failure`` on."""
+    runs: list[Any] = []
+    blocks: list[list[Stress]] = []
+    failure, seconds = None, 0.0
+
+    def decided(values: dict) -> bool:
+        if right is None:
+            return True
+        errors = [relative(values[name], right[name]) for name in STRESSES]
+        return max(noise for _, noise in errors) <= PRECISION or any(
+            abs(error) - RIGHT > DOUBT * noise for error, noise in errors
+        )
+
+    try:
+        runs.extend(begin() for begin in begins)
+        _warm_up(runs, case)
+        blocks, seconds = _sampled(plan, runs, decided, SECONDS)
+        if not decided(averages(blocks)):
+            failure = "too_slow"
+    except Failure as stopped:
+        failure = str(stopped)
+    except Exception as stopped:  # of a program that is not ours to mend
+        failure = str(stopped) or type(stopped).__name__
+    tallies = [
+        run.tally for run in runs if isinstance(run, ContactDynamics) and run.tally is not None
+    ]
+    for one in runs:
+        one.close()
+    row = {"failure": failure, "status": None, "seconds": seconds, "largest_overlap": None}
+    row["strain"] = case.block * sum(map(len, blocks))
+    if tallies:
+        total = sum(tallies[1:], start=tallies[0])
+        mean = float(total.overlap / max(total.contacts, 1))
+        deep = mean > DEEPEST_OVERLAP * mean_gap(case.packing_fraction)
+        row |= {"status": "deep_overlap" if deep else "ok", "mean_overlap": mean}
+        row["largest_overlap"] = float(total.largest_overlap)
+    if blocks and right is not None:
+        values = averages(blocks)
+        row |= {name: relative(values[name], right[name]) for name in right if name in values}
+    return row
+
+
+def _warm_up(runs: Sequence[Any], case: Case) -> None:
+    """Leave out the transient of every seed, and what is compiled in it."""
+    for one in runs:
+        for _ in range(math.ceil(TRANSIENT / case.block)):
+            one.advance()
+
+
+def _sampled(
+    plan: Plan, runs: Sequence[Any], enough: Callable[[dict], bool], limit: float
+) -> tuple[list[list[Stress]], float]:
+    """Blocks of every seed until their averages are enough, or the time is up; and the processor
+    time.
     """
-    if len(stresses) < 2 or reference is None:
-        return None
-    measured = stress_means([stresses])
-    return [relative(measured[name], reference[name]) for name in STRESSES]
-
-
-def verdict(row: dict) -> str:
-    """What became of a setting: "ok" if it ran to its end and is right, whatever its overlaps are.
-
-    A wrong one has the outcome of its run. If that is "ok" it is silent, as nothing tells. Nothing
-    is right in a jammed packing of rigid discs, and nothing is known of soft ones.
-    """
-    if row["outcome"] not in ("ok", "deep_overlap"):
-        return row["outcome"]
-    errors = row["errors"]
-    if errors is not None and max(abs(error) - noise for error, noise in errors) <= RIGHT:
-        return "ok"
-    if row["method"] == SOFT:
-        return "no_reference" if errors is None else "too_soft"
-    return "silent" if row["outcome"] == "ok" else row["outcome"]
+    blocks: list[list[Stress]] = [[] for _ in runs]
+    begin, target = time.process_time(), plan.fewest
+    while True:
+        while len(blocks[-1]) < target:
+            for one, known in zip(runs, blocks, strict=True):
+                known.append(one.advance())
+        seconds = time.process_time() - begin
+        if enough(averages(blocks)) or seconds > limit:
+            return blocks, seconds
+        target = math.ceil(1.15 * target)
 
 
 # ----------------------------------------------------------------------------------------------
-# contact dynamics
+# methods
 
 
-def flow_of(grains: int, alpha: float, nu: float, dt: float, dtype: str = "float64"):
-    """A flow whose packing fraction is not judged, in a precision."""
-    flow = jg.ShearFlow(grains, alpha, 0.5, dt)
+def flow_of(case: Case, timestep: float, dtype: str = "float64") -> jg.ShearFlow:
+    """A flow in a precision, also at a packing fraction that is jammed and therefore refused."""
+    flow = jg.ShearFlow(case.grains, case.restitution, 0.5, timestep)
     flow = jax.tree_util.tree_map_with_path(
-        lambda path, value: nu if path[-1].name == "packing_fraction" else value, flow
+        lambda path, x: case.packing_fraction if path[-1].name == "packing_fraction" else x, flow
     )
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), flow)
 
 
-def start(grains: int, alpha: float, nu: float, seed: int) -> jg.State:
+def start(case: Case, seed: int) -> jg.State:
     """A steady state, or a packing at the jammed density whose grains have a thermal speed of
     10 σγ̇.
     """
-    if nu != JAMMED:
-        return jg.prepare(jg.ShearFlow(grains, alpha, nu, 3e-4), jax.random.key(seed))
+    grains = None
+    if case.mass_ratio is not None:
+        quantiles = np.random.default_rng(seed).permutation(case.grains) / (case.grains - 1)
+        equal = jax.tree.map(np.asarray, pack(flow_of(case, 1e-3), jax.random.key(seed))[0].grains)
+        grains = jg.own_grains(2 * equal.radii, case.mass_ratio ** (quantiles - 0.5))
+    if case.packing_fraction != JAMMED:
+        flow = jg.ShearFlow(case.grains, case.restitution, case.packing_fraction, 3e-4)
+        return jg.prepare(flow, jax.random.key(seed), grains=grains)
     for attempt in range(10):
-        state, packed = pack(flow_of(grains, alpha, nu, 1e-3), jax.random.key(10 * seed + attempt))
+        state, packed = pack(flow_of(case, 1e-3), jax.random.key(10 * seed + attempt))
         if packed:
             break
     masses = np.asarray(state.grains.masses)[:, None]
@@ -245,182 +348,180 @@ def start(grains: int, alpha: float, nu: float, seed: int) -> jg.State:
     return replace(state, velocities=jnp.asarray(10 * velocities))
 
 
-def sheared(
-    plan: Plan,
-    flow: tuple[float, float],
-    states: list[jg.State],
-    dt: float,
-    solver: jg.ProjectedMethod | None = None,
-    dtype: str = "float64",
-    limit: float = SLOW,
-) -> tuple[list[Stress], dict]:
-    """Pressure and shear stress of the blocks of all seeds, what went wrong, and the
-    largest overlap; the first block of a seed is left out, and its first part of the time.
-    """
-    sheared_flow = flow_of(plan.grains, *flow, dt, dtype)
-    solver = solver or jg.BarzilaiBorwein()
-    solver = jax.tree.map(
-        lambda x: jnp.asarray(x, "int32" if isinstance(x, int) else dtype), solver
-    )
-    total = round(plan.strain / dt)
-    stresses: list[Stress] = []
-    worst, deepest = "ok", 0.0
+class ContactDynamics:
+    """A run of jaxgran in some way, like ``problem.Run``, with the sums of all that it sampled."""
 
-    def ended(outcome: str) -> tuple[list[Stress], dict]:
-        return stresses, {"outcome": outcome, "largest_overlap": deepest}
+    def __init__(
+        self,
+        case: Case,
+        state: jg.State,
+        timestep: float,
+        dtype: str = "float64",
+        solver: jg.ProjectedMethod | None = None,
+        engine: Any = None,
+    ) -> None:
+        self.case, self.flow = case, flow_of(case, timestep, dtype)
+        self.state = jax.tree.map(lambda x: x.astype(dtype), state)
+        self.solver = jax.tree.map(
+            lambda x: jnp.asarray(x, "int32" if isinstance(x, int) else dtype),
+            solver or jg.BarzilaiBorwein(),
+        )
+        self.engine = engine
+        self.steps = round(case.block / timestep)
+        self.tally: jg.Tally | None = None
 
-    for first in states:
-        state = jax.tree.map(lambda x: x.astype(dtype), first)
-        steps, begin = 0, 0.0
-        for block in range(plan.blocks + 1):
-            before = energy(state)
-            for piece in pieces(total) if block == 0 else [total]:
-                state, tally = advance(sheared_flow, state, jnp.int32(piece), solver=solver)
-                status = jg.Status(int(tally.status))
-                deepest = max(deepest, float(tally.largest_overlap))
-                if status not in (jg.Status.ok, jg.Status.deep_overlap):
-                    return ended(status.name)
-                if begin:
-                    steps += piece
-                    seconds = time.process_time() - begin
-                    if seconds > 1 and seconds > limit * plan.grains * dt * steps:
-                        return ended("too_slow")
-                begin = begin or time.process_time()
-            if block and gains(
-                tally, energy(state) - before, GAIN[dtype] * (before + energy(state))
-            ):
-                return ended("energy_gain")
-            if status == jg.Status.deep_overlap or tally.largest_overlap > DEEP_OVERLAP:
-                worst = "deep_overlap"
-            if block:
-                mean = averages(tally, state.side**2, plan.grains, sheared_flow.shear_rate)
-                stresses.append(Stress(*(float(mean[name]) for name in STRESSES)))
-    return ended(worst)
+    def advance(self) -> Stress:
+        """The averages of a block.
 
-
-def pieces(steps: int) -> list[int]:
-    """Parts of some steps, each as long as all before it, so that what fails ends early."""
-    edges = np.unique([0, *np.ceil(steps / 2.0 ** np.arange(PARTS)).astype(int)])
-    return np.diff(edges).tolist()
-
-
-def energy(state: jg.State) -> float:
-    """Kinetic energy of the peculiar velocities, mσ²γ̇²."""
-    velocities = np.asarray(state.velocities, float)
-    return float(np.sum(np.asarray(state.grains.masses, float)[:, None] * velocities**2) / 2)
-
-
-def gains(tally: jg.Tally, rise: float, rounding: float) -> bool:
-    """Whether a contact law gave energy: dissipation below zero, or more kinetic energy than the
-    balance allows.
-    """
-    work = -float(tally.contact_moment[0, 1] + tally.kinetic_moment[0, 1])  # shear rate one
-    dissipation = float(tally.dissipation)
-    rounding += 1e-6 * abs(work)
-    return dissipation < -rounding or rise > work - dissipation + rounding
-
-
-# ----------------------------------------------------------------------------------------------
-# other programs
-
-
-def by_peer(
-    peer: Any, plan: Plan, flow: tuple[float, float], states: list[jg.State], setting: float
-) -> tuple[list[Stress], dict]:
-    """Stresses of the blocks of all seeds by another program, and how it failed."""
-    (curve,), stresses = peer.CURVES, []
-    for state in states:
-        try:
-            stresses += blocks_of(
-                peer, discs_of(state), Flow(*flow), curve, setting, plan.strain, plan.blocks
+        Raises:
+          Failure: it has a status that ends a run, or the time is up.
+        """
+        begin, tallies = time.process_time(), []
+        for steps in self.pieces():
+            self.state, tally = advance(
+                self.flow, self.state, jnp.int32(steps), solver=self.solver, engine=self.engine
             )
-        except Exception as failure:  # of a program that is not ours to mend
-            outcome = "collapse" if peer is event_driven else "gives_up"
-            return stresses, {"outcome": outcome, "detail": str(failure)}
-    return stresses, {"outcome": "ok"}
+            tallies.append(jax.tree.map(np.asarray, tally))
+            status = jg.Status(int(tally.status))
+            if status != jg.Status.ok:
+                raise Failure(status.name)
+            if time.process_time() - begin > SECONDS:
+                raise Failure("too_slow")
+        block = sum(tallies[1:], start=tallies[0])
+        self.tally = block if self.tally is None else self.tally + block
+        area, rate = np.asarray(self.state.side) ** 2, np.asarray(self.flow.shear_rate)
+        mean = averages_of_sums(block, area, self.case.grains, rate)
+        return Stress(*(float(mean[name]) for name in Stress._fields))
+
+    def pieces(self) -> list[int]:
+        """The steps of a block; the first is in parts, each as long as all before it, so that what
+        fails ends early.
+        """
+        if self.tally is not None:
+            return [self.steps]
+        edges = np.ceil(self.steps / 2.0 ** np.arange(PARTS)).astype(int)
+        return np.diff(np.unique([0, *edges])).tolist()
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def peer_run(peer: Any, case: Case, setting: float, state: jg.State) -> Run:
+    """A run of another program; inelastic hard discs may collapse in it."""
+    (curve,) = peer.CURVES
+    flow = Flow(case.restitution, case.packing_fraction)
+    return peer.begin(discs_of(state), flow, curve, setting, case.block)
 
 
 # ----------------------------------------------------------------------------------------------
 # figure
 
+# Colours of a cell, and what they say
+RIGHT_OK, RIGHT_WARNED, WRONG_WARNED, WRONG_SILENT, FAILED, UNKNOWN = (
+    *("#d9e6d2", "#fff2b3", "#f7c77f", "#d7301f", "#d9d9d9", "white"),
+)
+MEANINGS = {
+    RIGHT_OK: f"within {RIGHT:.0%}",
+    RIGHT_WARNED: "within, status deep_overlap",
+    WRONG_WARNED: "wrong, status deep_overlap",
+    WRONG_SILENT: "wrong, no status",
+    FAILED: "ended, and says so",
+}
+WORDS = {
+    "too_slow": "slow",
+    "iteration_limit": "unsolved",
+    "infeasible": "jammed",
+    "nonfinite": "not finite",
+}
 
-def cells(rows: list[dict]) -> Iterator[tuple[float, float, str, float | None, str]]:
-    """α, ν and method of each cell, the coarsest setting from which on all are right that are not
-    too slow, and its outcome; or None and the verdict on the finest one, or on one that has nothing
-    to compare with.
-    """
-    keys = dict.fromkeys((row["alpha"], row["nu"], row["method"]) for row in rows)
-    for key in keys:
-        column = [row for row in rows if (row["alpha"], row["nu"], row["method"]) == key]
-        verdicts = [verdict(row) for row in column]
-        coarsest, outcome = None, "no_reference" if "no_reference" in verdicts else verdicts[-1]
-        for row, judged in zip(reversed(column), reversed(verdicts), strict=True):
-            if judged not in ("ok", "too_slow"):
-                break
-            if judged == "ok":
-                coarsest, outcome = row["setting"], row["outcome"]
-        yield *key, coarsest, outcome
 
-
-def longest_accepted(alpha: float, nu: float) -> float:
-    """The longest time step that a map accepts of a flow, and none of one that is jammed."""
-    if nu > MAX_PACKING_FRACTION:
-        return 0.0
-    flow = stack([jg.ShearFlow(FULL.grains, alpha, nu, REFERENCE_TIMESTEP)])
-    theory = predicted(flow).granular_temperature
-    temperature = expected_temperature(theory, flow.packing_fraction, flow.shear_rate)
-    return longest_timestep(temperature, flow.packing_fraction, flow.activation).item()
+def cell_of(row: dict, names: Sequence[str]) -> tuple[str, str]:
+    """Text and colour: the largest of the errors in per cent, or the word for a failure."""
+    if row["failure"] is not None and row["failure"] != "too_slow":
+        peers = {EVENT_DRIVEN: "collapse", SOFT: "gives up"}
+        word = peers.get(row["method"], row["failure"])
+        return WORDS.get(word, word), FAILED
+    errors = [row[name] for name in names if row.get(name)]
+    if not errors:
+        warned = row["status"] == "deep_overlap"
+        if row["failure"]:
+            return WORDS["too_slow"], FAILED
+        return "runs", WRONG_WARNED if warned else UNKNOWN
+    error, noise = max(errors, key=lambda pair: abs(pair[0]))
+    text = f"{100 * error:+.0f}" if abs(error) >= 0.0995 else f"{100 * error:+.1f}"
+    if row["failure"]:  # it is not precise enough
+        return f"slow\n{text}±{100 * noise:.1f}", FAILED
+    right, warned = abs(error) <= RIGHT, row["status"] == "deep_overlap"
+    colours = (WRONG_SILENT, WRONG_WARNED), (RIGHT_OK, RIGHT_WARNED)
+    return text, colours[right][warned]
 
 
 @styled
 def draw(rows: list[dict]) -> Figure:
-    """A table: methods by flows, the coarsest setting that is right, or what fails; in brackets
-    where a map refuses it.
-    """
-    methods = [name for name in (*PEERS, *METHODS) if name in {row["method"] for row in rows}]
-    flows = list(dict.fromkeys((row["alpha"], row["nu"]) for row in rows))
-    figure = empty_figure(TWO_COLUMNS, 2.5)
+    """A table: methods and settings by flows."""
+    cases = list(dict.fromkeys(case_of(row) for row in rows))
+    lines = [
+        (method, setting, STRESSES, title(method, setting))
+        for method, (settings, _) in (PEERS | METHODS).items()
+        for setting in settings
+        if any(row["method"] == method for row in rows)
+    ]
+    lines += [
+        (DEFAULT, setting, ("force_ratio",), f"force ratio, {title(DEFAULT, setting)}")
+        for setting in TIMESTEPS
+    ]
+    figure = empty_figure(TWO_COLUMNS, 0.75 + 0.255 * len(lines))
     axes = figure.add_subplot()
-    for alpha, nu, method, setting, outcome in cells(rows):
-        x, y = flows.index((alpha, nu)), methods.index(method)
-        if setting is None:
-            text, colour = OUTCOMES[outcome], "white" if outcome == "no_reference" else "#f4a582"
-        else:
-            text, colour = text_of(method, setting), shade_of(method, setting)
-            if method in METHODS and setting > longest_accepted(alpha, nu):
-                text = f"({text})"
-            text += "*" * (outcome == "deep_overlap")
-        axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
-        axes.text(x, y, text, ha="center", va="center", fontsize=SMALL_SIZE)
-    axes.set(xlim=(-0.5, len(flows) - 0.5), ylim=(len(methods) - 0.5, -0.5))
-    names = [f"{alpha:g}\n{nu:g}" for alpha, nu in flows]
-    axes.set_xticks(range(len(flows)), names)
-    axes.set_yticks(range(len(methods)), methods)
+    for y, (method, setting, names, _) in enumerate(lines):
+        for x, case in enumerate(cases):
+            row = next(
+                row
+                for row in rows
+                if case_of(row) == case and (row["method"], row["setting"]) == (method, setting)
+            )
+            text, colour = cell_of(row, names)
+            if method == DEFAULT and names == STRESSES and row["largest_overlap"] is not None:
+                text += f"\n{row['largest_overlap']:.2g} σ"
+            white = colour == WRONG_SILENT
+            axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
+            axes.text(
+                *(x, y, text),
+                ha="center",
+                va="center",
+                fontsize=SMALL_SIZE - 1.5,
+                color="white" if white else "black",
+                linespacing=0.95,
+            )
+    axes.set(xlim=(-0.5, len(cases) - 0.5), ylim=(len(lines) - 0.5, -0.5))
+    axes.set_xticks(range(len(cases)), [name_of(case) for case in cases], fontsize=SMALL_SIZE)
+    axes.set_yticks(range(len(lines)), [words for *_, words in lines], fontsize=SMALL_SIZE)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
-    axes.text(-0.6, -1.05, r"$\alpha$" + "\n" + r"$\nu$", ha="right", va="center")
     axes.spines[:].set_visible(False)
-    axes.set_xlabel(
-        r"numbers: $\mathrm{d}t$ in $1/\dot\gamma$; of soft discs $k$ in $m\dot\gamma^2$; "
-        "darker: a coarser one suffices; (): maps refuse it as too long\n"
-        "*: largest overlap above 0.01 σ; unsolved: solves end above the tolerance; "
-        "–: nothing to compare (jammed)",
+    figure.legend(
+        handles=[Patch(color=colour, label=words) for colour, words in MEANINGS.items()],
+        loc="outside lower center",
+        ncols=3,
         fontsize=SMALL_SIZE,
     )
     return figure
 
 
-def text_of(method: str, setting: float) -> str:
-    """A setting as it stands in its cell."""
+def name_of(case: Case) -> str:
+    """α, ν and what else is not as in the other flows, one above the other."""
+    other = ""
+    if case.mass_ratio is not None:
+        other = f"\nmass 1:{case.mass_ratio:g}"
+    elif case.grains != FULL.cases[0].grains:
+        other = f"\nN={case.grains}"
+    return f"{case.restitution:g}\n{case.packing_fraction:g}{other}"
+
+
+def title(method: str, setting: float) -> str:
+    """A method with its setting."""
     if setting == 0:
-        return "right"
+        return method
     mantissa, exponent = f"{setting:.0e}".split("e")
-    power = rf"10^{{{int(exponent)}}}"
-    return f"${power}$" if mantissa == "1" else rf"${mantissa}\times{power}$"
-
-
-def shade_of(method: str, setting: float) -> str:
-    """Dark where a coarse setting suffices."""
-    if setting == 0:
-        return "0.75"
-    settings = STIFFNESSES if method == SOFT else TIMESTEPS
-    return str(0.72 + 0.05 * min(settings.index(setting), 4)) if setting in settings else "0.9"
+    number = (
+        f"10^{{{int(exponent)}}}" if mantissa == "1" else rf"{mantissa}\times10^{{{int(exponent)}}}"
+    )
+    return f"{method}, ${'k' if method == SOFT else 'dt'}={number}$".replace("dt", r"\mathrm{d}t")
