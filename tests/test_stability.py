@@ -2,6 +2,9 @@
 wrong average silent only if no status tells.
 """
 
+from functools import partial
+from unittest.mock import Mock
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +12,7 @@ import pytest
 
 import jaxgran as jg
 from benchmarks import stability
+from benchmarks.peers.problem import Run, Stress
 from jaxgran.model.status import DEEP_OVERLAP, Status
 
 
@@ -66,17 +70,13 @@ def test_a_sample_ends_when_it_is_precise_wrong_beyond_doubt_or_its_time_is_up(m
     case = stability.Case(0.5, 0.5)
     right = dict.fromkeys(stability.STRESSES, (1.0, 0.002))
 
-    class Noise:
-        def __init__(self, seed: int, mean: float) -> None:
-            self.noise, self.mean = np.random.default_rng(seed), mean
-
-        def advance(self) -> stability.Stress:
-            return stability.Stress(*(self.mean + 0.15 * self.noise.normal(size=4)))
-
-        def close(self) -> None: ...
+    def blocks(seed: int, mean: float) -> Run:
+        """Blocks that are independent, with a scatter of 0.15."""
+        random = np.random.default_rng(seed)
+        return Run(lambda: Stress(*(mean + 0.15 * random.normal(size=4))), Mock())
 
     def ends(mean: float) -> dict:
-        return stability.measured(plan, case, [lambda s=s: Noise(s, mean) for s in range(3)], right)
+        return stability.measured(plan, case, [partial(blocks, s, mean) for s in range(3)], right)
 
     precise, wrong = ends(1.02), ends(1.6)
     assert precise["failure"] is wrong["failure"] is None
