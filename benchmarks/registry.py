@@ -150,7 +150,7 @@ BENCHMARKS = (
     Benchmark(
         "speed_vs_accuracy",
         "What does accuracy cost, here and in other programs?",
-        (35, 3),
+        (60, 4),
         ("speed_vs_accuracy.json", "speed_vs_accuracy.png"),
         one_core=True,
         module="peers.compare",

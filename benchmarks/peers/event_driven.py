@@ -1,5 +1,7 @@
-"""The event-driven program of ``independent.event_driven`` as a peer: no time step and no overlap,
-so a single setting. Inelastic hard discs collapse where grains push in chains, and it says so.
+"""The event-driven program of ``independent.event_driven`` as a peer: no time step and no overlap.
+
+Inelastic hard discs have no setting; they collapse where grains push in chains, and it says so.
+With a duration of contact, the TC model, no collapse lasts.
 """
 
 import numpy as np
@@ -8,7 +10,8 @@ from benchmarks.independent.event_driven import Discs as HardDiscs
 from benchmarks.independent.event_driven import Law, averages, sheared
 from benchmarks.peers.problem import Discs, Flow, Run, Stress
 
-CURVES = {"event-driven": (0.0,)}  # the setting is the duration of a contact
+# The setting is the duration of a contact, in 1/γ̇
+CURVES = {"event-driven": (0.0,), "TC model": (1e-3, 3e-4, 1e-4, 3e-5, 1e-5)}
 MOST_COLLISIONS = (
     2000.0  # of a disc in a unit of strain, twenty times those of flows that do not collapse
 )

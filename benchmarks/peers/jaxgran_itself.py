@@ -1,5 +1,6 @@
-"""jaxgran as a peer of the others: several time steps at the default tolerance, and several
-tolerances at one time step; midpoint rule.
+"""jaxgran as a peer of the others: several time steps at the default tolerance, several tolerances
+at one time step, the engine in JAX alone and for a batch, and the plain projected Jacobi method;
+midpoint rule.
 """
 
 import jax
@@ -12,8 +13,16 @@ from jaxgran.model.grains import Grains
 
 TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-6)
-BY_TOLERANCE = "jaxgran by tolerance"
-CURVES = {"jaxgran": TIMESTEPS, BY_TOLERANCE: TOLERANCES}
+BY_TOLERANCE, BY_JAX, BATCH = "jaxgran by tolerance", "JAX engine", "JAX engine, 16 flows"
+JACOBI = "projected Jacobi"
+FLOWS = 16  # of the batch
+CURVES = {
+    "jaxgran": TIMESTEPS,
+    BY_TOLERANCE: TOLERANCES,
+    BY_JAX: TIMESTEPS,
+    BATCH: (1e-3,),
+    JACOBI: TIMESTEPS,
+}
 DEFAULT_TOLERANCE, MIDDLE_TIMESTEP = 1e-4, 1e-3
 
 
@@ -22,7 +31,11 @@ def missing() -> str | None:
 
 
 def begin(discs: Discs, flow: Flow, curve: str, setting: float, duration: float) -> Run:
-    """A run at one time step or tolerance."""
+    """A run at one time step or tolerance.
+
+    The flows of the batch begin at different times of one flow, and together last as long as the
+    one flow of the other curves.
+    """
     timestep, tolerance = (
         (MIDDLE_TIMESTEP, setting) if curve == BY_TOLERANCE else (setting, DEFAULT_TOLERANCE)
     )
@@ -33,24 +46,38 @@ def begin(discs: Discs, flow: Flow, curve: str, setting: float, duration: float)
         timestep=timestep,
         shear_rate=flow.shear_rate,
     )
-    solver, strain = jg.BarzilaiBorwein(tolerance), duration * flow.shear_rate
+    solver = jg.Jacobi(tolerance) if curve == JACOBI else jg.BarzilaiBorwein(tolerance)
+    engine = jg.Jax() if curve in (BY_JAX, BATCH) else None
+    strain = duration * flow.shear_rate
+    state = state_of(discs)
+    if curve == BATCH:
+        strain /= FLOWS
+        states = [state]
+        for _ in range(FLOWS - 1):
+            states.append(jg.sample(law, states[-1], 0.5, blocks=1)[0])
+        state = jax.tree.map(lambda *x: jnp.stack(x), *states)
+
+    def one(state: jg.State):
+        return jg.sample(law, state, strain, blocks=1, solver=solver, engine=engine)
+
+    sampled = jax.jit(jax.vmap(one)) if curve == BATCH else one
+
+    def advance() -> Stress:
+        nonlocal state
+        state, sample = jax.block_until_ready(sampled(state))
+        averages = jax.tree.map(np.asarray, sample).averages
+        return Stress(*(float(np.mean(averages[name])) for name in Stress._fields))
+
+    return Run(advance, lambda: discs_of(state[0] if curve == BATCH else state))
+
+
+def state_of(discs: Discs) -> jg.State:
+    """A state of jaxgran; without weak types, or a second call would compile again."""
     grains = Grains(jnp.asarray(discs.radii), jnp.asarray(discs.masses))
     arrays = (
         np.asarray(x, float) for x in (discs.positions, discs.velocities, discs.side, discs.tilt)
     )
-    state = jg.State(
-        grains, *map(jnp.asarray, arrays)
-    )  # no weak types, or the second call would compile again
-
-    def advance() -> Stress:
-        nonlocal state
-        state, sample = jax.block_until_ready(
-            jg.sample(law, state, strain, blocks=1, solver=solver)
-        )
-        sample = jax.tree.map(np.asarray, sample)
-        return Stress(*(float(sample.averages[name]) for name in Stress._fields))
-
-    return Run(advance, lambda: discs_of(state))
+    return jg.State(grains, *map(jnp.asarray, arrays))
 
 
 def discs_of(state: jg.State) -> Discs:
