@@ -4,10 +4,12 @@ Replicas of 256 grains are advanced from the same states by what jaxgran takes f
 a few of them, by the rival. Replica-steps per second are printed and written as JSON, with the
 pressure against that of the rival and the peak of the device's memory where it tells. Where the
 replicas advance in lockstep their number decides the speed, so it is raised, and one large flow is
-advanced as well. States are prepared on the processor.
+advanced as well. States are prepared on the processor. With ``--engine numba`` a device takes the
+numba engine, whose calls must repeat to the bit.
 
     python -m benchmarks device_batch           # a processor: 2 minutes
     python -m benchmarks device_batch --quick   # under a minute
+    python -m benchmarks device_batch --engine numba   # on a CUDA device
 """
 
 import time
@@ -23,7 +25,8 @@ from benchmarks.independent import contact_dynamics
 from benchmarks.output import Output
 from benchmarks.step_cost import rival_arguments
 from jaxgran.dynamics.batching import in_lockstep
-from jaxgran.dynamics.engine import DEFAULT_NUMERICS, select_engine
+from jaxgran.dynamics.engine import Numerics, engine_named, select_engine
+from jaxgran.dynamics.numba_engine.team.handler import MOST_GRAINS
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.observe import advance_batch
 
@@ -35,9 +38,12 @@ DISTINCT, APART = 16, 0.5  # states of a batch, and the strain between them
 TURNS, ENOUGH_SECONDS = 3, 60
 
 
-def run(output: Output) -> None:
+def run(output: Output, engine: str = "auto") -> None:
     """Compare every batch at every point, print, and write JSON after each."""
+    numerics = Numerics(engine=engine_named(engine))
     batches, points = BATCHES + (ACCELERATOR_BATCHES if in_lockstep() else ()), POINTS
+    if engine == "numba":
+        batches = tuple(batch for batch in batches if batch[1] <= MOST_GRAINS)
     if output.quick:
         batches, points = ((64, 256, 1e-3),), POINTS[:2]
     device = jax.local_devices()[0]
@@ -51,7 +57,7 @@ def run(output: Output) -> None:
     for (replicas, grains, dt), (alpha, nu) in product(batches, points):
         flow = jg.ShearFlow(grains=grains, restitution=alpha, packing_fraction=nu, timestep=dt)
         about = {"replicas": replicas, "grains": grains, "dt": dt, "alpha": alpha, "nu": nu}
-        rows.append(about | compare(flow, replicas))
+        rows.append(about | compare(flow, replicas, numerics))
         print(
             "{replicas:8d}{grains:8d}{dt:7.0e}{alpha:6.2g}{nu:6.2g}{device:8.2g}{rival:23.2g}"
             "{ratio:7.2g}{pressure:10.5f}{compilation:13.1f}".format(**rows[-1]),
@@ -59,11 +65,14 @@ def run(output: Output) -> None:
         )
         memory = (device.memory_stats() or {}).get("peak_bytes_in_use")
         output.write_rows(
-            f"device_batch_{device.platform}", head | {"peak_bytes": memory}, "rows", rows
+            f"device_batch_{device.platform}{'_numba' * (engine == 'numba')}",
+            head | {"peak_bytes": memory},
+            "rows",
+            rows,
         )
 
 
-def compare(flow: jg.ShearFlow, replicas: int) -> dict:
+def compare(flow: jg.ShearFlow, replicas: int, numerics: Numerics) -> dict:
     """Replica-steps per second from the same states, the fastest of some calls in turn, and the
     mean pressure of the device over that of the processor.
     """
@@ -82,14 +91,12 @@ def compare(flow: jg.ShearFlow, replicas: int) -> dict:
     flows = jax.tree.map(lambda x: np.full(replicas, x), flow)
     ways = {  # what is done in a call, and how many replica-steps that is
         "device": (
-            partial(
-                advance_batch, flows, DEFAULT_NUMERICS, batch, np.full(replicas, np.int32(steps))
-            ),
+            partial(advance_batch, flows, numerics, batch, np.full(replicas, np.int32(steps))),
             steps * replicas,
         ),
         "rival": (partial(rivals, flow, distinct, steps), steps * len(distinct)),
     }
-    seconds = {name: [] for name in ways}
+    seconds, of_turns = {name: [] for name in ways}, []
     pressures = [pressure(tally, flow, distinct[0]) for tally in tallies]
     begun = time.perf_counter()
     for turn in range(1 + TURNS):  # the first compiles
@@ -100,13 +107,14 @@ def compare(flow: jg.ShearFlow, replicas: int) -> dict:
             result = jax.block_until_ready(call())
             seconds[name].append(time.perf_counter() - start)
             if name == "device":
-                on_device = pressure(result[1], flow, distinct[0])[: len(distinct)]
+                of_turns.append(pressure(result[1], flow, distinct[0])[: len(distinct)])
     speeds = {name: done / min(seconds[name][1:]) for name, (_, done) in ways.items()}
     return {
-        "engine": select_engine(DEFAULT_NUMERICS).name,
+        "engine": select_engine(numerics).name,
+        "repeats": all(np.array_equal(x, of_turns[0]) for x in of_turns),
         **speeds,
         "ratio": speeds["device"] / speeds["rival"],
-        "pressure": float(np.mean(on_device) / np.mean(pressures)),
+        "pressure": float(np.mean(of_turns[0]) / np.mean(pressures)),
         "compilation": seconds["device"][0] - min(seconds["device"][1:]),
     }
 

@@ -146,6 +146,7 @@ BENCHMARKS = (
         "loop?",
         (2, 1),
         ("device_batch_gpu.json",),
+        (Option("--engine", "that of the device", choices=("auto", "numba")),),
     ),
     Benchmark(
         "speed_vs_accuracy",

@@ -25,6 +25,7 @@ from jaxgran.contact.projected_methods import (
 from jaxgran.dynamics.batching import with_forward_derivative, with_own_batching
 from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.dynamics.numba_engine.observed import advance_by_numba
+from jaxgran.dynamics.numba_engine.team.handler import MOST_GRAINS, has_cuda
 from jaxgran.dynamics.observer import Observe, uses_traced_values
 from jaxgran.dynamics.tally import Tally
 from jaxgran.environment import default_device, precision
@@ -109,14 +110,17 @@ class Jax:
 
 @dataclass(frozen=True)
 class Numba:
-    """The engine for processors, compiled by numba: float64 and the solver ``BarzilaiBorwein``
-    only.
+    """The engine compiled by numba: float64 and the solver ``BarzilaiBorwein`` only.
 
-    It solves clusters one by one, by Gauss–Seidel sweeps and then by the method of the solver, to
-    its ``tolerance`` and within its ``max_steps``. Under ``jax.vmap`` replicas advance on all
-    cores, with the same bits on any number of threads; the environment variable
-    ``NUMBA_NUM_THREADS`` sets their number. ``jax.lax.map`` takes one at a time. Derivatives in
-    forward mode, and the values beside them, are those of ``Jax``.
+    On a processor it is the automatic choice. It solves clusters one by one, by Gauss–Seidel sweeps
+    and then by the method of the solver, to its ``tolerance`` and within its ``max_steps``. Under
+    ``jax.vmap`` replicas advance on all cores, with the same bits on any number of threads; the
+    environment variable ``NUMBA_NUM_THREADS`` sets their number. ``jax.lax.map`` takes one at a
+    time. Derivatives in forward mode, and the values beside them, are those of ``Jax``.
+
+    On a CUDA device a warp advances each replica of a batch, without records for ``observe``, up to
+    65,535 grains. Its code has been run on processors only, by one lane and by 32, and no device
+    has run it yet: there it must be asked for.
 
     Examples:
       >>> Numba()
@@ -129,7 +133,7 @@ class Numba:
         """What this engine cannot do of what is asked for, in words; "" if it can do all."""
         platform = default_device().platform
         wrong = {
-            f"on the device {platform}": platform != "cpu",
+            f"on the device {platform}": platform != "cpu" and not has_cuda(),
             f"in {dtype} ({_ENABLE_X64} computes in float64)": dtype != "float64",
             f"with the solver {solver_name(solver)}": type(solver) is not BarzilaiBorwein,
         }
@@ -150,6 +154,16 @@ class Numba:
         """As ``Jax.advance``; the list of near pairs outlives a block, where nothing is
         observed.
         """
+        if default_device().platform != "cpu":
+            if observe is not None:
+                raise InputError(
+                    "engine numba observes on a processor only: take jg.Jax() on a device."
+                )
+            if flow.grains > MOST_GRAINS:
+                raise InputError(
+                    f"engine numba takes at most {MOST_GRAINS} grains on a device, not "
+                    f"{flow.grains}: take jg.Jax()."
+                )
         run = partial(advance_by_numba, observe=observe)
         differentiable = partial(advance_by_jax, observe=observe)
         return with_forward_derivative(run, differentiable)(flow, solver, state, steps)
@@ -199,7 +213,8 @@ def checked_numerics(solver: Any, engine: Any) -> Numerics:
 
 
 def select_engine(numerics: Numerics, state: State | None = None) -> Engine:
-    """The engine that was asked for, or ``Numba`` if it can advance a state, or else ``Jax``.
+    """The engine that was asked for, or ``Numba`` on a processor if it can advance a state, or else
+    ``Jax``.
 
     Args:
       numerics: the solver, and the engine that was asked for.
@@ -215,7 +230,7 @@ def select_engine(numerics: Numerics, state: State | None = None) -> Engine:
             "state must be of the precision in which JAX computes, float32, not float64: begin "
             f"with {_ENABLE_X64}."
         )
-    engine = numerics.engine or Numba()
+    engine = numerics.engine or (Numba() if default_device().platform == "cpu" else Jax())
     wrong = engine.refuses(dtype, numerics.solver)
     if not wrong:
         return engine

@@ -18,7 +18,7 @@ from jaxgran.contact.network import MOST_CONTACTS
 from jaxgran.dynamics.advance import advance_replica
 from jaxgran.dynamics.batch import predicted_cost, run_batch
 from jaxgran.dynamics.engine import Numerics
-from jaxgran.dynamics.numba_engine import ffi
+from jaxgran.dynamics.numba_engine.call import register
 from jaxgran.dynamics.observer import Observe, nothing_observed, observe_at, without_contacts
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow
@@ -90,7 +90,7 @@ def reporting(advance: ObserveBatch, report: Report) -> ObserveBatch:
     return advance_and_report
 
 
-_advance_replica = persistent_jit(advance_replica, ffi.register)
+_advance_replica = persistent_jit(advance_replica, register)
 _observe_replica = jax.jit(advance_replica, static_argnames="observe")
 
 

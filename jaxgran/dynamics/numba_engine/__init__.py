@@ -1,4 +1,5 @@
-"""The engine for processors: one time loop, compiled by numba and called by XLA.
+"""The engine of one time loop for each replica, compiled by numba and called by XLA.
 
-It imports `contact` and `model`, and the table of the running sums. Begin with `loop`.
+It imports `contact` and `model`, and the table of the running sums. Begin with `loop`; `team` is
+the same for CUDA devices.
 """

@@ -67,7 +67,7 @@ def predict_contact_steps(count, t, earliest, horizon, shift, flow, grains, pair
             flights[0, n], flights[1, n], flights[2, n], flights[3, n] = dx, dy, ux, uy
             flights[4, n] = grains.constants[i].radius + grains.constants[j].radius
         for n in range((size + _TOGETHER - 1) // _TOGETHER * _TOGETHER):
-            strikes, begins, ends = _contact_steps(
+            strikes, begins, ends = contact_steps(
                 flights[0, n],
                 flights[1, n],
                 flights[2, n],
@@ -90,7 +90,7 @@ def predict_contact_steps(count, t, earliest, horizon, shift, flow, grains, pair
 
 
 @njit
-def _contact_steps(dx, dy, ux, uy, reach, t, earliest, horizon, flow):
+def contact_steps(dx, dy, ux, uy, reach, t, earliest, horizon, flow):
     """The entries of the calendar of a pair: the step in which it strikes, and the first and last
     step in which it is a contact.
     """

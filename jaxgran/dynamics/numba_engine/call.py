@@ -10,7 +10,9 @@ from jaxtyping import Array, Int
 from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.jax_engine import end_of_advance
 from jaxgran.dynamics.numba_engine import ffi, layout
+from jaxgran.dynamics.numba_engine.team import handler
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally
+from jaxgran.environment import default_device
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State, kinetic_energy, status_at_start
@@ -53,6 +55,19 @@ def sums_of_row(row: Array) -> RunningSums:
     return RunningSums(row[..., :NUMBERS], row[..., layout.STATUS].astype(jnp.int32))
 
 
+def register() -> None:
+    """Load the engine for JAX's default device, or compile it, and register it with XLA; once in a
+    process.
+
+    Raises:
+      InputError: see ``ffi.register``.
+    """
+    if default_device().platform == "cpu":
+        ffi.register()
+    else:
+        handler.register()
+
+
 class NumbaCall(NamedTuple):
     """What a call of the numba engine returns.
 
@@ -89,9 +104,14 @@ def call_numba(
       begin: ``first_row``, or the last row of the call to go on with.
       room: number of records, static, for one block; 0 records nothing. With records the call ends
         unfinished where its list of near pairs ends, or the room.
+
+    On a CUDA device the records are the memory of the loop, and ``room`` must be 0.
     """
-    ffi.register()
+    register()
     dtype, grains = state.positions.dtype, state.grains
+    records = (room, layout.record_numbers(flow.grains))
+    if default_device().platform != "cpu":
+        records = (1, handler.words_of_memory(flow.grains))
     inputs = layout.Inputs(
         side=state.side,
         restitution=flow.restitution,
@@ -105,7 +125,7 @@ def call_numba(
         state.positions.shape,
         state.positions.shape,
         (*steps.shape, layout.RESULTS),
-        (room, layout.record_numbers(flow.grains)),
+        records,
     ]
     results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
     operands = (

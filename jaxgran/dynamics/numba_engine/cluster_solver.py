@@ -36,7 +36,7 @@ SWEEPS = 200  # after which a cluster counts as stiff
 _PARTS = 8
 # Over-relaxation by the number of contacts: within 0.05 of what needs fewest updates in clusters of
 # 2 to 400 contacts.
-_RELAXATION = np.minimum(1 + 0.075 * np.log2(np.maximum(np.arange(641), 1)), 1.7)
+RELAXATION = np.minimum(1 + 0.075 * np.log2(np.maximum(np.arange(641), 1)), 1.7)
 
 
 @njit
@@ -53,11 +53,11 @@ def solve_cluster(m, target, max_steps, grains, network, clusters):
     iterations, squared_residual = _sweep(size, target, min(max_steps, SWEEPS), clusters)
     status = OK if squared_residual <= target else ITERATION_LIMIT
     if status != OK:
-        jammed = _is_jammed(size, clusters)
+        jammed = is_jammed(size, clusters)
         if squared_residual < math.inf and iterations < max_steps:
-            more, squared_residual = _descend(size, target, max_steps - iterations, clusters)
+            more, squared_residual = descend(size, target, max_steps - iterations, clusters)
             # of the last iterate: impulses of the best may not have grown yet
-            jammed = _is_jammed(size, clusters)
+            jammed = is_jammed(size, clusters)
             iterations += more
             for c in range(size):
                 rows[c].impulse = iterate[c].best
@@ -72,24 +72,15 @@ def solve_cluster(m, target, max_steps, grains, network, clusters):
 @njit
 def _take_contacts(start, size, grains, network, clusters):
     """Copy the contacts of a cluster for the solver, one from each part of the cluster in turn."""
-    source, places, ends = clusters.source, clusters.places, clusters.ends
-    rows, dv, contacts, constants = clusters.rows, clusters.dv, network.rows, grains.constants
+    source, places, dv = clusters.source, clusters.places, clusters.dv
     one, last = np.uint64(1), np.uint64(start) + size
     length = size // np.uint64(_PARTS) + one if size >= 2 * _PARTS else one  # of a part
     c = begin = np.uint64(0)
     n = np.uint64(start)
     while c < size:
         place = source[n]
-        i, j = network.ends[FIRST, place], network.ends[SECOND, place]
-        mi, mj = constants[i].inverse_mass, constants[j].inverse_mass
-        mobility = mi + mj
-        reduced_mass = 1 / mobility
-        places[c], ends[c, FIRST], ends[c, SECOND] = place, i, j
-        rows[c].mu_nx = contacts[NX, place] * reduced_mass
-        rows[c].mu_ny = contacts[NY, place] * reduced_mass
-        rows[c].mu_u, rows[c].inverse_mu = contacts[APPROACH, place] * reduced_mass, mobility
-        rows[c].inverse_mu_mi, rows[c].inverse_mu_mj = mobility * mi, mobility * mj
-        rows[c].impulse = 0.0
+        places[c] = place
+        i, j = take_contact(c, place, grains, network, clusters)
         dv[i, 0] = dv[i, 1] = dv[j, 0] = dv[j, 1] = 0.0
         c += one
         n += length
@@ -99,21 +90,38 @@ def _take_contacts(start, size, grains, network, clusters):
 
 
 @njit
-def _mu_response(c, rows, ends, dv):
+def take_contact(c, place, grains, network, clusters):
+    """Copy a contact of the network for the solver, without an impulse; returns its grains."""
+    rows, ends, contacts, constants = clusters.rows, clusters.ends, network.rows, grains.constants
+    i, j = network.ends[FIRST, place], network.ends[SECOND, place]
+    mi, mj = constants[i].inverse_mass, constants[j].inverse_mass
+    mobility = mi + mj
+    reduced_mass = 1 / mobility
+    ends[c, FIRST], ends[c, SECOND] = i, j
+    rows[c].mu_nx = contacts[NX, place] * reduced_mass
+    rows[c].mu_ny = contacts[NY, place] * reduced_mass
+    rows[c].mu_u, rows[c].inverse_mu = contacts[APPROACH, place] * reduced_mass, mobility
+    rows[c].inverse_mu_mi, rows[c].inverse_mu_mj = mobility * mi, mobility * mj
+    rows[c].impulse = 0.0
+    return i, j
+
+
+@njit
+def mu_response_of(c, rows, ends, dv):
     """μ (W J) of a contact, from the changes of the grains' velocities."""
     i, j = ends[c, FIRST], ends[c, SECOND]
     return rows[c].mu_nx * (dv[i, 0] - dv[j, 0]) + rows[c].mu_ny * (dv[i, 1] - dv[j, 1])
 
 
 @njit
-def _is_jammed(size, clusters):
+def is_jammed(size, clusters):
     """Whether impulses have grown without moving anything: JᵀWJ is far below −Jᵀu⁻, which it is at
     a solution.
     """
     rows, ends, dv = clusters.rows, clusters.ends, clusters.dv
     j_w_j = minus_j_u = 0.0
     for c in range(size):
-        j_w_j += rows[c].impulse * _mu_response(c, rows, ends, dv) * rows[c].inverse_mu
+        j_w_j += rows[c].impulse * mu_response_of(c, rows, ends, dv) * rows[c].inverse_mu
         minus_j_u -= rows[c].impulse * rows[c].mu_u * rows[c].inverse_mu
     return j_w_j < JAMMED_RESPONSE * minus_j_u
 
@@ -128,38 +136,50 @@ def _sweep(size, target, max_sweeps, clusters):
     the changes of the grains' velocities.
     """
     rows, ends, dv = clusters.rows, clusters.ends, clusters.dv
-    relaxation = _RELAXATION[min(size, np.uint64(_RELAXATION.size - 1))]
+    relaxation = RELAXATION[min(size, np.uint64(RELAXATION.size - 1))]
     sweeps, squared_residual, keep_going = 0, math.inf, True
     while keep_going:
         estimate = 0.0
-        for c in range(size):  # without a branch, which would be mispredicted
-            i, j = ends[c, FIRST], ends[c, SECOND]
-            ix, iy, jx, jy = dv[i, 0], dv[i, 1], dv[j, 0], dv[j, 1]
-            mu_nx, mu_ny, impulse = rows[c].mu_nx, rows[c].mu_ny, rows[c].impulse
-            change = max(
-                relaxation * (mu_nx * (jx - ix) + mu_ny * (jy - iy) - rows[c].mu_u), -impulse
-            )
-            rows[c].impulse = impulse + change
-            per_mass_i = change * rows[c].inverse_mu_mi
-            per_mass_j = change * rows[c].inverse_mu_mj
-            dv[i, 0], dv[i, 1] = ix + per_mass_i * mu_nx, iy + per_mass_i * mu_ny
-            dv[j, 0], dv[j, 1] = jx - per_mass_j * mu_nx, jy - per_mass_j * mu_ny
-            error = change * rows[c].inverse_mu
-            estimate += error * error
+        for c in range(size):
+            change = relax(c, relaxation, rows, ends, dv)
+            estimate += change * change
         sweeps += 1
         keep_going = sweeps < max_sweeps and estimate < math.inf
         if estimate <= target * relaxation * relaxation or not keep_going:
             squared_residual = 0.0
             for c in range(size):
-                mu_velocity = _mu_response(c, rows, ends, dv) + rows[c].mu_u
-                error = min(rows[c].impulse, mu_velocity) * rows[c].inverse_mu
+                error = error_of(c, rows, ends, dv)
                 squared_residual += error * error
             keep_going &= not squared_residual <= target
     return sweeps, squared_residual
 
 
 @njit
-def _descend(size, target, max_iterations, clusters):
+def relax(c, relaxation, rows, ends, dv):
+    """One update of a contact, without a branch, which would be mispredicted; returns the change of
+    its impulse over its reduced mass.
+    """
+    i, j = ends[c, FIRST], ends[c, SECOND]
+    ix, iy, jx, jy = dv[i, 0], dv[i, 1], dv[j, 0], dv[j, 1]
+    mu_nx, mu_ny, impulse = rows[c].mu_nx, rows[c].mu_ny, rows[c].impulse
+    change = max(relaxation * (mu_nx * (jx - ix) + mu_ny * (jy - iy) - rows[c].mu_u), -impulse)
+    rows[c].impulse = impulse + change
+    per_mass_i = change * rows[c].inverse_mu_mi
+    per_mass_j = change * rows[c].inverse_mu_mj
+    dv[i, 0], dv[i, 1] = ix + per_mass_i * mu_nx, iy + per_mass_i * mu_ny
+    dv[j, 0], dv[j, 1] = jx - per_mass_j * mu_nx, jy - per_mass_j * mu_ny
+    return change * rows[c].inverse_mu
+
+
+@njit
+def error_of(c, rows, ends, dv):
+    """The part of a contact in the residual."""
+    mu_velocity = mu_response_of(c, rows, ends, dv) + rows[c].mu_u
+    return min(rows[c].impulse, mu_velocity) * rows[c].inverse_mu
+
+
+@njit
+def descend(size, target, max_iterations, clusters):
     """The guarded method of Barzilai and Borwein, from the impulses where the sweeps ended.
 
     Returns the products with W and the squared residual of the best iterate, whose impulses are in
@@ -197,7 +217,7 @@ def _descend(size, target, max_iterations, clusters):
         # with the last step s: sᵀWs, sᵀDs and (Ws)ᵀD⁻¹(Ws)
         squared_residual = curvature = squared_step = squared_response = 0.0
         for c in range(size):
-            bound, mu_response = iterate[c].bound, _mu_response(c, rows, ends, dv)
+            bound, mu_response = iterate[c].bound, mu_response_of(c, rows, ends, dv)
             response = mu_response * rows[c].inverse_mu
             error = min(rows[c].impulse, mu_response + rows[c].mu_u) * rows[c].inverse_mu
             step, change = iterate[c].step, response - iterate[c].response

@@ -66,28 +66,36 @@ def strike(touched_count, t, shear_rate, grains, network, clusters, kinetic, max
 
     A position in the laboratory is r + v t, so a change of v by Δv shifts r by −Δv t.
     """
-    motion, constants = grains.motion, grains.constants
-    impulses, touched = network.impulses, network.touched
-    xx, xy, yy = kinetic
     finite = True
     for n in range(touched_count):
-        g = touched[n]
+        g = network.touched[n]
         network.degree[g], clusters.reached[g] = 0, 0
-        px, py = impulses[g, 0], impulses[g, 1]
-        dvx, dvy = px * constants[g].inverse_mass, py * constants[g].inverse_mass
-        if dvx != 0.0 or dvy != 0.0:
-            cx, cy = motion[g].vx - shear_rate * (motion[g].y + motion[g].vy * t), motion[g].vy
-            xx += px * (2 * cx + dvx)
-            xy += px * cy + py * cx + px * dvy
-            yy += py * (2 * cy + dvy)
-            speed = math.sqrt((cx + dvx) * (cx + dvx) + (cy + dvy) * (cy + dvy))
-            finite &= speed < math.inf
-            max_speed = max(max_speed, speed)
-            motion[g].vx += dvx
-            motion[g].vy += dvy
-            motion[g].x -= dvx * t
-            motion[g].y -= dvy * t
-    return (xx, xy, yy), max_speed, finite
+        kinetic, speed = strike_grain(g, t, shear_rate, grains, network.impulses, kinetic)
+        finite &= speed < math.inf
+        max_speed = max(max_speed, speed)
+    return kinetic, max_speed, finite
+
+
+@njit
+def strike_grain(g, t, shear_rate, grains, impulses, kinetic):
+    """Change the velocity of a grain; returns Σ m c ⊗ c after it, and its speed, or 0 where nothing
+    strikes it.
+    """
+    motion, inverse_mass, speed = grains.motion, grains.constants[g].inverse_mass, 0.0
+    xx, xy, yy = kinetic
+    px, py = impulses[g, 0], impulses[g, 1]
+    dvx, dvy = px * inverse_mass, py * inverse_mass
+    if dvx != 0.0 or dvy != 0.0:
+        cx, cy = motion[g].vx - shear_rate * (motion[g].y + motion[g].vy * t), motion[g].vy
+        xx += px * (2 * cx + dvx)
+        xy += px * cy + py * cx + px * dvy
+        yy += py * (2 * cy + dvy)
+        speed = math.sqrt((cx + dvx) * (cx + dvx) + (cy + dvy) * (cy + dvy))
+        motion[g].vx += dvx
+        motion[g].vy += dvy
+        motion[g].x -= dvx * t
+        motion[g].y -= dvy * t
+    return (xx, xy, yy), speed
 
 
 @njit

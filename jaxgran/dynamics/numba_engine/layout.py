@@ -53,6 +53,7 @@ RECORD_I, RECORD_J, RECORD_OF_CONTACT = 5, 6, 7  # behind the rows of the networ
 
 NEVER = np.int32(2**31 - 1)  # a step of the calendar that does not come
 MANY = 2.0**30  # steps, the end of the calendar
+KERNEL, WARP = "jaxgran_advance", 32  # on a CUDA device: its name, and the lanes of a replica
 LANES = 64  # entries of the calendar that are compared together
 LEAST_SHIFT = 5  # blocks of entries are of 2**5 at least
 EPSILON = float(np.finfo(np.float64).eps)

@@ -74,8 +74,8 @@ from jaxgran.dynamics.velocity_scales import READ_AFTER
 image_in_cell, remap_tilt = CELL["image_in_cell"], CELL["remap_tilt"]
 
 # Expected within the skin: wide lists cost the events, narrow ones the searches
-_PAIRS_PER_GRAIN = 2.7
-_NARROWEST_SKIN = 0.05  # σ, the usual skin of a dense flow
+PAIRS_PER_GRAIN = 2.7
+NARROWEST_SKIN = 0.05  # σ, the usual skin of a dense flow
 
 
 @njit
@@ -144,8 +144,8 @@ def time_loop(
     widest_skin = side / 2 - largest_diameter  # nearest images are unique
     if widest_skin < 0.0:
         status, widest_skin = max(status, CAPACITY), 0.0
-    expected_skin = math.sqrt(2 * _PAIRS_PER_GRAIN * side * side / (math.pi * count)) - 1.0
-    usual_skin = min(max(expected_skin, _NARROWEST_SKIN), widest_skin)
+    expected_skin = math.sqrt(2 * PAIRS_PER_GRAIN * side * side / (math.pi * count)) - 1.0
+    usual_skin = min(max(expected_skin, NARROWEST_SKIN), widest_skin)
 
     life = LIFE / shear_rate if shear_rate > 0.0 else math.inf
     room, recorded = records.shape[0], 0

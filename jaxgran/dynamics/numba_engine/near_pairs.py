@@ -12,7 +12,7 @@ nearest_image = CELL["nearest_image"]
 
 # strain: the longest life of a list, in which a peculiar speed grows by a factor of 1.1 at most
 LIFE = 0.1
-_ATTEMPTS = 12  # with ever narrower skins, while a list has more pairs than room
+ATTEMPTS = 12  # with ever narrower skins, while a list has more pairs than room
 
 
 @njit
@@ -32,7 +32,7 @@ def search(grains, pairs, side, tilt, largest_diameter, skin):
     """
     capacity = pairs.of_grain.size // 2
     count = 0
-    for _ in range(_ATTEMPTS):
+    for _ in range(ATTEMPTS):
         count = find_near_pairs(grains, pairs, side, tilt, largest_diameter + skin, skin, capacity)
         if count <= capacity:
             break

@@ -22,19 +22,12 @@ def make_network(contacts, t, flow, grains, pairs, network):
     """Write the contacts of a step and their grains; returns the number of the grains, Σ min(0,
     u⁻)² and the largest overlap.
     """
-    ends, rows, degree, touched = network.ends, network.rows, network.degree, network.touched
-    constants = grains.constants
+    ends, degree, touched = network.ends, network.degree, network.touched
     touched_count, scale, largest_overlap = 0, 0.0, 0.0
     for c in range(contacts):
-        i, j, dx, dy, ux, uy = pair_motion(network.near_pair[c], t, flow, grains, pairs)
-        distance = math.sqrt(dx * dx + dy * dy)
-        dx, dy = dx / distance, dy / distance
-        approach = ux * dx + uy * dy
-        ends[FIRST, c], ends[SECOND, c] = i, j
-        rows[NX, c], rows[NY, c], rows[APPROACH, c] = dx, dy, approach
-        rows[DISTANCE, c], rows[IMPULSE, c] = distance, 0.0
-        largest_overlap = max(largest_overlap, constants[i].radius + constants[j].radius - distance)
-        scale += min(approach, 0.0) * approach
+        overlap, squared_approach = write_contact(c, t, flow, grains, pairs, network)
+        largest_overlap = max(largest_overlap, overlap)
+        scale += squared_approach
         for end in range(2):
             g = ends[end, c]
             if degree[g] == 0:
@@ -42,6 +35,21 @@ def make_network(contacts, t, flow, grains, pairs, network):
                 touched_count += 1
             degree[g] += 1
     return touched_count, scale, largest_overlap
+
+
+@njit
+def write_contact(c, t, flow, grains, pairs, network):
+    """Write a contact of the network; returns its overlap and min(0, u⁻)²."""
+    ends, rows, constants = network.ends, network.rows, grains.constants
+    i, j, dx, dy, ux, uy = pair_motion(network.near_pair[c], t, flow, grains, pairs)
+    distance = math.sqrt(dx * dx + dy * dy)
+    dx, dy = dx / distance, dy / distance
+    approach = ux * dx + uy * dy
+    ends[FIRST, c], ends[SECOND, c] = i, j
+    rows[NX, c], rows[NY, c], rows[APPROACH, c] = dx, dy, approach
+    rows[DISTANCE, c], rows[IMPULSE, c] = distance, 0.0
+    overlap = constants[i].radius + constants[j].radius - distance
+    return overlap, min(approach, 0.0) * approach
 
 
 @njit

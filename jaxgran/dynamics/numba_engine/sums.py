@@ -18,16 +18,16 @@ from jaxgran.dynamics.tally import CONTACT, place_of, span_of
 
 contact_terms, kinetic_means = LAW["contact_terms"], LAW["kinetic_means"]
 
-_FIRST_TERM, _TERMS = span_of(CONTACT).start, span_of(CONTACT).stop - span_of(CONTACT).start
-_PADDED = (_TERMS + 7) // 8 * 8  # the terms are added eight at a time
+FIRST_TERM, TERMS = span_of(CONTACT).start, span_of(CONTACT).stop - span_of(CONTACT).start
+_PADDED = (TERMS + 7) // 8 * 8  # the terms are added eight at a time
 # Terms that fill the last eight, and are added to nothing: zeros in their place cost 3 to 6 % of a
 # step.
-_PADS = _PADDED - _TERMS
+_PADS = _PADDED - TERMS
 _DURATION, _STEPS, _KINETIC = place_of("duration"), place_of("steps"), place_of("kinetic_moment")
 COLLISIONS = place_of("collisions")
 _SOLVES, _ITERATIONS = place_of("solves"), place_of("iterations")
 _UNCONVERGED = place_of("unconverged")
-_LARGEST_OVERLAP, _WORST_RESIDUAL = place_of("largest_overlap"), place_of("worst_residual")
+LARGEST_OVERLAP, _WORST_RESIDUAL = place_of("largest_overlap"), place_of("worst_residual")
 
 
 @njit
@@ -49,39 +49,46 @@ def add_flight(sums, steps, flight, strain, kinetic):
 @njit
 def add_contacts(sums, contacts, one_plus_alpha, grains, network):
     """Add what the contacts of one step contribute, by the law of a contact."""
-    ends, rows, constants = network.ends, network.rows, grains.constants
-    impulses, loaded, step_sums = network.impulses, network.loaded, network.step_sums
+    step_sums = network.step_sums
     for n in range(_PADDED):
         step_sums[n] = 0.0
     for c in range(contacts):
-        i, j = ends[FIRST, c], ends[SECOND, c]
-        nx, ny, approach, distance = rows[NX, c], rows[NY, c], rows[APPROACH, c], rows[DISTANCE, c]
-        mi, mj = constants[i].inverse_mass, constants[j].inverse_mass
-        impulse = one_plus_alpha * rows[IMPULSE, c]
-        change = nx * (impulses[i, 0] * mi - impulses[j, 0] * mj) + ny * (
-            impulses[i, 1] * mi - impulses[j, 1] * mj
-        )
-        contact = SolvedContact(
-            nx=nx,
-            ny=ny,
-            distance=distance,
-            overlap=max(constants[i].radius + constants[j].radius - distance, 0.0),
-            approach=approach,
-            half_change=change / 2,
-            one_plus_alpha=one_plus_alpha,
-            impulse=impulse,
-            binary_impulse=-one_plus_alpha * min(approach, 0.0) / (mi + mj),
-            clustered=impulse if loaded[i] > 1 or loaded[j] > 1 else 0.0,
-            used=1.0,
-            loaded=1.0 if impulse > 0.0 else 0.0,
-            approaching=1.0 if approach < 0.0 else 0.0,
-        )
-        terms = contact_terms(contact)
+        terms = terms_of(c, one_plus_alpha, grains, network)
         padded = terms[:] + terms[:_PADS]
         for n in range(_PADDED):
             step_sums[n] += padded[n]
-    for n in range(_TERMS):
-        sums[_FIRST_TERM + n] += step_sums[n]
+    for n in range(TERMS):
+        sums[FIRST_TERM + n] += step_sums[n]
+
+
+@njit
+def terms_of(c, one_plus_alpha, grains, network):
+    """What a contact contributes, from the impulses on its grains."""
+    ends, rows, constants = network.ends, network.rows, grains.constants
+    impulses, loaded = network.impulses, network.loaded
+    i, j = ends[FIRST, c], ends[SECOND, c]
+    nx, ny, approach, distance = rows[NX, c], rows[NY, c], rows[APPROACH, c], rows[DISTANCE, c]
+    mi, mj = constants[i].inverse_mass, constants[j].inverse_mass
+    impulse = one_plus_alpha * rows[IMPULSE, c]
+    change = nx * (impulses[i, 0] * mi - impulses[j, 0] * mj) + ny * (
+        impulses[i, 1] * mi - impulses[j, 1] * mj
+    )
+    contact = SolvedContact(
+        nx=nx,
+        ny=ny,
+        distance=distance,
+        overlap=max(constants[i].radius + constants[j].radius - distance, 0.0),
+        approach=approach,
+        half_change=change / 2,
+        one_plus_alpha=one_plus_alpha,
+        impulse=impulse,
+        binary_impulse=-one_plus_alpha * min(approach, 0.0) / (mi + mj),
+        clustered=impulse if loaded[i] > 1 or loaded[j] > 1 else 0.0,
+        used=1.0,
+        loaded=1.0 if impulse > 0.0 else 0.0,
+        approaching=1.0 if approach < 0.0 else 0.0,
+    )
+    return contact_terms(contact)
 
 
 @njit
@@ -90,5 +97,5 @@ def add_solve(sums, iterations, residual, status, overlap):
     sums[_SOLVES] += 1
     sums[_ITERATIONS] += iterations
     sums[_UNCONVERGED] += status != OK
-    sums[_LARGEST_OVERLAP] = max(sums[_LARGEST_OVERLAP], overlap)
+    sums[LARGEST_OVERLAP] = max(sums[LARGEST_OVERLAP], overlap)
     sums[_WORST_RESIDUAL] = max(sums[_WORST_RESIDUAL], residual)

@@ -11,7 +11,7 @@ from jaxgran.dynamics.velocity_scales import BOX_GRAINS, WAVES
 remap_tilt = CELL["remap_tilt"]
 
 DURATION, READ_UNTIL = place_of("duration"), place_of("read_until")
-_LOCAL, _WAVE = place_of("local_kinetic"), place_of("wave_kinetic")
+LOCAL, WAVE = place_of("local_kinetic"), place_of("wave_kinetic")
 _AMPLITUDES = 4 * len(WAVES)  # real and imaginary parts of both components
 
 
@@ -22,9 +22,7 @@ def read_velocity_scales(t, tilt, flow, grains, network, clusters, sums):
 
     ``tilt`` is that of the cell then. It uses memory of the contacts, which is free between steps.
     """
-    motion, constants, count = grains.motion, grains.constants, grains.motion.size
-    side, shear_rate, boxes = flow.side, flow.shear_rate, clusters.matrices
-    amplitudes = network.step_sums
+    count, boxes, amplitudes = grains.motion.size, clusters.matrices, network.step_sums
     across = max(1, int(np.rint(math.sqrt(count / BOX_GRAINS))))
     tilt = remap_tilt(tilt)
     for box in range(across * across):
@@ -33,15 +31,11 @@ def read_velocity_scales(t, tilt, flow, grains, network, clusters, sums):
         amplitudes[n] = 0.0
     energy, total = 0.0, 0.0  # Σ m c² and Σ m
     for g in range(count):
-        x, y = motion[g].x + motion[g].vx * t, motion[g].y + motion[g].vy * t
-        cx, cy, mass = motion[g].vx - shear_rate * y, motion[g].vy, 1 / constants[g].inverse_mass
-        sx, sy = (x - tilt * y) / side, y / side
-        sx, sy = sx - np.floor(sx), sy - np.floor(sy)
+        sx, sy, mass, cx, cy = place_and_velocity(g, t, tilt, flow, grains)
         px, py = mass * cx, mass * cy
         energy += px * cx + py * cy
         total += mass
-        row, column = whole_part(sy * across, across - 1), whole_part(sx * across, across - 1)
-        box = across * row + column
+        box = box_of(sx, sy, across)
         boxes[box, 0] += mass
         boxes[box, 1] += px
         boxes[box, 2] += py
@@ -63,6 +57,23 @@ def read_velocity_scales(t, tilt, flow, grains, network, clusters, sums):
     for n in range(_AMPLITUDES):
         squares += amplitudes[n] * amplitudes[n]
     since = sums[DURATION] - sums[READ_UNTIL]
-    sums[_LOCAL] += since * energy / (2 * max(count - occupied, 1))
-    sums[_WAVE] += since * 2 * squares / (_AMPLITUDES * total)
+    sums[LOCAL] += since * energy / (2 * max(count - occupied, 1))
+    sums[WAVE] += since * 2 * squares / (_AMPLITUDES * total)
     sums[READ_UNTIL] = sums[DURATION]
+
+
+@njit
+def place_and_velocity(g, t, tilt, flow, grains):
+    """Place of a grain in the cell, from 0 to 1, its mass and its peculiar velocity."""
+    motion, side = grains.motion, flow.side
+    x, y = motion[g].x + motion[g].vx * t, motion[g].y + motion[g].vy * t
+    cx, cy = motion[g].vx - flow.shear_rate * y, motion[g].vy
+    sx, sy = (x - tilt * y) / side, y / side
+    return sx - np.floor(sx), sy - np.floor(sy), 1 / grains.constants[g].inverse_mass, cx, cy
+
+
+@njit
+def box_of(sx, sy, across):
+    """The number of the box of a place."""
+    row, column = whole_part(sy * across, across - 1), whole_part(sx * across, across - 1)
+    return across * row + column
