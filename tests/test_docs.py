@@ -20,9 +20,11 @@ from jaxgran.cli import app
 ROOT = Path(jaxgran.__file__).parents[1]
 PAPER = ROOT / "docs" / "paper"
 DOCS = ROOT / "docs"
-HIDDEN = {PAPER, DOCS / "_build"}  # from the site
+HIDDEN = {PAPER / "paper.md", DOCS / "_build"}  # from the site
 PAGES = sorted(
-    path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md") if not HIDDEN & {*path.parents}
+    path.relative_to(DOCS).as_posix()
+    for path in DOCS.rglob("*.md")
+    if not HIDDEN & {path, *path.parents}
 )
 MODULES = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts)

@@ -48,8 +48,10 @@ def equal_work(flow: dict, curve: str) -> tuple[Choice, Choice] | None:
 
 
 def ratio(flow: dict, curve: str) -> str:
-    """Time of another program over that of jaxgran, from the setting before the cheapest one within
-    the target to this one, as it is reached somewhere between; "> " where it is not reached.
+    """Time of another program over that of jaxgran; "> " where it does not reach the target.
+
+    That of soft discs is given from the stiffness before the cheapest one within the target to this
+    one, as the target is reached somewhere between.
     """
     pair = equal_work(flow, curve)
     if pair is None or not pair[0].reached:
@@ -57,7 +59,8 @@ def ratio(flow: dict, curve: str) -> str:
     ours, theirs = pair
     rows = rows_of(flow, curve)
     place = rows.index(theirs.row)
-    costs = [row[COST] / ours.row[COST] for row in rows[max(0, place - 1) : place + 1]]
+    before = max(0, place - 1) if curve == "LAMMPS" else place
+    costs = [row[COST] / ours.row[COST] for row in rows[before : place + 1]]
     if not theirs.reached:
         return f"> {_two_digits(costs[-1])}"
     first, last = _two_digits(min(costs)), _two_digits(max(costs))
