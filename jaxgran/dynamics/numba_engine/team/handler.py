@@ -84,7 +84,8 @@ def register_handler(target: str, platform: str, launch: Launch) -> None:
 
 @cache
 def register() -> None:
-    """Register the engine on CUDA; once in a process."""
+    """Load the kernel, or compile it, and register it on CUDA; once in a process."""
+    kernel()
     register_handler(ffi.TARGET, "CUDA", launch_on_stream)
 
 
