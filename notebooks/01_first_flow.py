@@ -187,6 +187,32 @@ axes[1].set(xscale="log", xlabel=r"time step $\dot\gamma\,\mathrm{d}t$")
 plt.show()
 
 # %% [markdown]
+# ## A map with `jax.vmap`
+#
+# The same function for every restitution and packing fraction at once: the shear stress over that
+# of the same contacts as binary collisions.
+
+# %%
+alphas, nus = np.meshgrid([0.3, 0.9] if quick else [0.1, 0.3, 0.5, 0.7, 0.9], [0.5, 0.6, 0.7, 0.76])
+flows = jg.ShearFlow(grains, alphas.ravel(), nus.ravel(), timestep=1e-3)
+keys = jax.random.split(jax.random.key(2), alphas.size)
+states = jg.prepare(flows, keys, 2.0 if quick else None)
+_, samples = jax.vmap(jg.sample, (0, 0, None))(flows, states, 2 * strain)
+ratio, error = samples.stress_ratio[:, 0, 1], samples.errors()["stress_ratio"][:, 0, 1]
+
+# %%
+figure, axes = plt.subplots(figsize=(3.35, 2.4))
+for nu, marker in zip(np.unique(nus), "os^D", strict=True):
+    at = nus.ravel() == nu
+    axes.errorbar(
+        alphas.ravel()[at], ratio[at], error[at], fmt=f"{marker}-", ms=4, label=rf"$\nu={nu:g}$"
+    )
+axes.axhline(1, color="0.6", lw=0.8)
+axes.set(xlabel=r"restitution $\alpha$", ylabel="shear stress over that\nof binary collisions")
+axes.legend(frameon=False, ncols=2)
+plt.show()
+
+# %% [markdown]
 # **Contacts carry it, and in dissipative flow clusters of grains that push at once carry much of
 # it.** The force ratio says how much more these push than the same pairs would alone, at the given
 # time step.

@@ -206,7 +206,7 @@ def made(
             made(0.01, 0.02, of_temperature=0.02, anisotropy=1.1, pairs=1.05),
             (
                 "agrees with the pressure (error 1.0 ± 2.0 %) and the local temperature (error 2.0",
-                "violated most is that velocities are isotropic",
+                "comes from assuming that velocities are isotropic",
             ),
         ),
         (

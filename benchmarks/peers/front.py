@@ -6,7 +6,7 @@ from typing import NamedTuple
 OBSERVABLES = ("pressure", "shear_stress")
 TARGET = 0.03
 COST = "cpu_seconds_per_strain"
-TIME_STEPPED = "numba loop", "JAX engine", "projected Jacobi"  # beside jaxgran itself
+TIME_STEPPED = "numba loop", "JAX engine", "projected Jacobi"
 
 
 class Choice(NamedTuple):

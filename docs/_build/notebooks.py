@@ -1,21 +1,13 @@
-"""Notebooks as pages: their text and code, and what they showed where they were run.
-
-The notebooks of the project have no outputs. The environment variable ``JAXGRAN_NOTEBOOKS`` names a
-folder with notebooks that were run (``pytest --nbmake --overwrite`` on a copy); their outputs are
-shown then.
-"""
+"""Notebooks as pages: their text and code, and what they showed when they were run."""
 
 import base64
 import json
-import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[2]
-RUN = "JAXGRAN_NOTEBOOKS"  # environment variable: folder of notebooks that were run
 # characters of HTML that stand in the page itself; longer HTML is a file in a frame
 LONGEST = 50_000
-BARE = "*The site was built without running this notebook, so it has no outputs.*"
 NAMES = [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))]
 
 
@@ -28,26 +20,22 @@ class Shown(NamedTuple):
 
 def shown(name: str) -> Shown:
     """The page of a notebook of this project."""
-    folder = Path(os.environ.get(RUN) or ROOT / "notebooks")
-    return page_of(json.loads((folder / f"{name}.ipynb").read_text(encoding="utf-8")), name)
+    notebook = (ROOT / "notebooks" / f"{name}.ipynb").read_text(encoding="utf-8")
+    return page_of(json.loads(notebook), name)
 
 
 def page_of(notebook: dict[str, Any], name: str) -> Shown:
     """A notebook in the form of its JSON as a page; warnings are left out, as they name folders of
     a machine.
     """
-    parts, files, run = [], {}, False
+    parts, files = [], {}
     for cell in notebook["cells"]:
         source = "".join(cell["source"])
         if cell["cell_type"] == "markdown":
             parts.append(source)
             continue
         parts.append(f"```python\n{source}\n```")
-        for output in cell["outputs"]:
-            run = True
-            parts.append(_output(output, f"{name}_{len(files)}", files))
-    if not run:
-        parts.insert(1, BARE)
+        parts.extend(_output(output, f"{name}_{len(files)}", files) for output in cell["outputs"])
     return Shown("\n\n".join(part for part in parts if part), files)
 
 

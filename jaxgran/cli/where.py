@@ -112,7 +112,7 @@ def _print_plane(flow: Validity, factors: bool, corrected: bool) -> None:
         factor_rows.append([*pair, *_factors(point, in_brackets)])
     about = "In brackets: 95 % half-width of the last digits"
     names = ("error in %", "if corrected")[: 1 + corrected]
-    columns = ("α", "ν", "force ratio", "pressure", *names, "violated most")
+    columns = ("α", "ν", "force ratio", "pressure", *names, "largest error from")
     print_table(f"Error of kinetic theory in the pressure. {about}.", columns, rows)
     if factors:
         names = (name.replace("_", " ") for name in ASSUMPTIONS)
@@ -138,7 +138,7 @@ def _entries(flow: Validity) -> dict[str, Entry]:
         "verdict": Entry(flow.verdict(), "what kinetic theory can predict, in words", None),
         "restitution": Entry(flow.restitution, "coefficient of restitution"),
         "packing_fraction": Entry(flow.packing_fraction, "packing fraction"),
-        "fails_first": Entry(flow.fails_first(), "assumption that is violated most", None),
+        "fails_first": Entry(flow.fails_first(), "assumption with the largest error", None),
     }
     of_theory = "kinetic theory over measured average, less one"
     groups = (

@@ -139,7 +139,7 @@ def _verdict(flow: Validity) -> str:
         cause = f"Each of its assumptions holds within {within}; all together make {enskog}"
     else:
         cause = (
-            f"The assumption that is violated most is that {ASSUMPTIONS[first].statement}: alone "
+            f"The largest error comes from assuming that {ASSUMPTIONS[first].statement}: alone "
             f"it makes {enskog} {_deviation(flow.factors[first].value)}; all together make it"
         )
     ratio, ratio_ci95 = map(float, flow.measured[RATIO])
