@@ -141,6 +141,7 @@ def run(output: Output, folder: Path | None = None) -> None:
         }
         results = [done[case].result() for case in plan.cases]
     head = {
+        "planned": len(plan.cases),
         "seeds": plan.seeds,
         "right": RIGHT,
         "precision": PRECISION,
@@ -463,7 +464,7 @@ def cell_of(row: dict, names: Sequence[str]) -> tuple[str, str]:
     error, noise = max(errors, key=lambda pair: abs(pair[0]))
     text = f"{100 * error:+.0f}" if abs(error) >= 0.0995 else f"{100 * error:+.1f}"
     if row["failure"]:
-        text += f"±{100 * noise:.1f}"
+        text += f"±{100 * noise:.2g}"
         if not math.isfinite(noise) or abs(abs(error) - RIGHT) < 2 * noise:
             return text, FAILED
     colours = (WRONG_SILENT, WRONG_WARNED), (RIGHT_OK, RIGHT_WARNED)
@@ -510,6 +511,9 @@ def draw(rows: list[dict]) -> Figure:
     axes.set_xticks(range(len(cases)), [name_of(case) for case in cases], fontsize=SMALL_SIZE)
     axes.set_yticks(range(len(lines)), [words for *_, words in lines], fontsize=SMALL_SIZE)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
+    corner = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "bottom"}
+    words = "error in %, and below it the largest overlap;  " + r"$\alpha$" + "\n" + r"$\nu$"
+    axes.annotate(words, (0, 1), (-3, 4), ha="right", fontsize=SMALL_SIZE, **corner)
     axes.spines[:].set_visible(False)
     figure.legend(
         handles=[Patch(color=colour, label=words) for colour, words in MEANINGS.items()],

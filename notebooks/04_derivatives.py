@@ -131,6 +131,8 @@ axes[0].set(xlabel="iteration of Adam", ylabel=r"$\chi^2$ per degree of freedom"
 axes[0].legend(fontsize=7, frameon=False)
 axes[1].axhline(truth, color="C3", lw=1)
 axes[1].set(xscale="log", xlabel="strain of a window", ylabel=r"restitution $\alpha$")
+axes[1].set_xticks(list(fits), [f"{strain:g}" for strain in fits])
+axes[1].minorticks_off()
 plt.show()
 
 # %% [markdown]
