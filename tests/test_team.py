@@ -211,6 +211,10 @@ def device(monkeypatch):
         def __getattr__(self, name: str):
             def function(*arguments):
                 asked.append(name)
+                if name == "cuLibraryLoadData":
+                    _, code, options, values, count, *_ = arguments
+                    assert code == b"code\0" and count == 1
+                    assert (options[0], values[0]) == (0, 128)
                 if name == "cuLaunchKernel":
                     _, *grid, stream, pointers, extra = arguments
                     assert grid[1:3] == [1, 1] and grid[3:] == [32, 1, 1, 0] and extra is None
@@ -229,14 +233,16 @@ def device(monkeypatch):
 
     original, driver = handler.call_xla, Driver()
     monkeypatch.setattr(handler, "driver", lambda: driver)
-    monkeypatch.setattr(handler, "kernel", lambda: None)
+    monkeypatch.setattr(handler, "kept_ptx", lambda: "code")
+    handler.kernel.cache_clear()
     monkeypatch.setattr(handler, "call_xla", call_xla)
     for module in (call, engine):
         monkeypatch.setattr(module, "default_device", lambda: SimpleNamespace(platform="gpu"))
     monkeypatch.setattr(call, "register", lambda: None)
     monkeypatch.setattr(ffi, "TARGET", f"jaxgran_acted_{next(TARGETS)}")
     handler.register_handler(ffi.TARGET, "cpu", handler.launch_on_stream)
-    return SimpleNamespace(asked=asked, driver=driver)
+    yield SimpleNamespace(asked=asked, driver=driver)
+    handler.kernel.cache_clear()
 
 
 def test_a_batch_is_one_launch_with_the_bits_of_each_replica_alone(device) -> None:

@@ -21,6 +21,7 @@ MOST_GRAINS = 2**16 - 1  # both ends of a near pair found in a search are in 32 
 _API, _CONTEXT, _ARGS, _RETS = 2, 3, 9, 14  # words of a call frame
 _ERROR_CREATE, _STREAM_GET = 6, 10  # words of the table of XLA's functions
 _METADATA_EXTENSION, _INTERNAL_ERROR = 1, 13
+_MAX_REGISTERS, _REGISTERS = 0, 128  # option of the driver's compiler, and its value for a thread
 _VERSION = 2 << 32  # 0.2 of the interface: the minor number in the upper half
 _KEPT: list[Any] = []  # functions that XLA calls
 # Called with the frame's table of functions and context, the number of replicas, and the arguments
@@ -139,7 +140,9 @@ def kernel() -> ctypes.c_void_p:
     library, handle = ctypes.c_void_p(), ctypes.c_void_p()
     code = kept_ptx().encode() + b"\0"
     _check(driver().cuInit(0))
-    _check(driver().cuLibraryLoadData(ctypes.byref(library), code, None, None, 0, None, None, 0))
+    options, values = (ctypes.c_int * 1)(_MAX_REGISTERS), (ctypes.c_void_p * 1)(_REGISTERS)
+    given = code, options, values, 1, None, None, 0
+    _check(driver().cuLibraryLoadData(ctypes.byref(library), *given))
     _check(driver().cuLibraryGetKernel(ctypes.byref(handle), library, layout.KERNEL.encode()))
     return handle
 

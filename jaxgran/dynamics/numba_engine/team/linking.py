@@ -24,7 +24,7 @@ from jaxgran.dynamics.numba_engine.team.loop import advance_team
 from jaxgran.dynamics.numba_engine.team.memory import array_at, memory_at
 
 BUFFERS = 10  # addresses of what a call is given and returns, without records
-REGISTERS, PROCESSOR = 128, "sm_70"
+PROCESSOR = "sm_70"
 _WORDS = 5 + BUFFERS + 1  # lane, lanes, replica, grains, blocks, the buffers, and memory
 _FEATURES = "+ptx63"
 _FUNCTIONS = ("sqrt", "floor", "ceil", "rint")  # of the mathematical library
@@ -127,8 +127,7 @@ define void @{BARRIER}() convergent alwaysinline {{
   call void @llvm.nvvm.barrier0()
   ret void
 }}
-define ptx_kernel void @{layout.KERNEL}({_PARAMETERS}, i64 %size) convergent
-    "nvvm.maxnreg"="REGISTERS" {{
+define ptx_kernel void @{layout.KERNEL}({_PARAMETERS}, i64 %size) convergent {{
   %result = alloca i64
   %exception = alloca ptr
   %thread = call i32 @llvm.nvvm.read.ptx.sreg.tid.x()
@@ -145,7 +144,7 @@ define ptx_kernel void @{layout.KERNEL}({_PARAMETERS}, i64 %size) convergent
 
 
 @cache
-def ptx(lanes: int = layout.WARP, registers: int = REGISTERS) -> str:
+def ptx(lanes: int = layout.WARP) -> str:
     """The kernel in PTX, for all NVIDIA devices from ``PROCESSOR`` on: grains, blocks, addresses,
     and the memory of all replicas and of one of them.
     """
@@ -153,5 +152,4 @@ def ptx(lanes: int = layout.WARP, registers: int = REGISTERS) -> str:
     llvm.initialize_all_asmprinters()
     target = llvm.Target.from_triple("nvptx64-nvidia-cuda")
     machine = target.create_target_machine(cpu=PROCESSOR, features=_FEATURES, opt=3)
-    entry = _ON_DEVICE.replace("LANES", str(lanes)).replace("REGISTERS", str(registers))
-    return machine.emit_assembly(linked(machine, entry))
+    return machine.emit_assembly(linked(machine, _ON_DEVICE.replace("LANES", str(lanes))))
