@@ -485,7 +485,7 @@ def draw(rows: list[dict]) -> Figure:
         (DEFAULT, setting, ("force_ratio",), f"force ratio, {title(DEFAULT, setting)}")
         for setting in TIMESTEPS
     ]
-    figure = empty_figure(TWO_COLUMNS, 0.75 + 0.255 * len(lines))
+    figure = empty_figure(TWO_COLUMNS, 0.9 + 0.29 * len(lines))
     axes = figure.add_subplot()
     for y, (method, setting, names, _) in enumerate(lines):
         for x, case in enumerate(cases):
@@ -503,23 +503,24 @@ def draw(rows: list[dict]) -> Figure:
                 *(x, y, text),
                 ha="center",
                 va="center",
-                fontsize=SMALL_SIZE - 1.5,
+                fontsize=SMALL_SIZE,
                 color="white" if white else "black",
-                linespacing=0.95,
+                linespacing=0.9,
             )
     axes.set(xlim=(-0.5, len(cases) - 0.5), ylim=(len(lines) - 0.5, -0.5))
     axes.set_xticks(range(len(cases)), [name_of(case) for case in cases], fontsize=SMALL_SIZE)
     axes.set_yticks(range(len(lines)), [words for *_, words in lines], fontsize=SMALL_SIZE)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
     corner = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "bottom"}
-    words = "error in %, and below it the largest overlap;  " + r"$\alpha$" + "\n" + r"$\nu$"
-    axes.annotate(words, (0, 1), (-3, 4), ha="right", fontsize=SMALL_SIZE, **corner)
+    axes.annotate("$\\alpha$\n$\\nu$", (0, 1), (-3, 4), ha="right", fontsize=SMALL_SIZE, **corner)
     axes.spines[:].set_visible(False)
     figure.legend(
         handles=[Patch(color=colour, label=words) for colour, words in MEANINGS.items()],
         loc="outside lower center",
         ncols=3,
         fontsize=SMALL_SIZE,
+        title="error in %, and below it the largest overlap",
+        title_fontsize=SMALL_SIZE,
     )
     return figure
 
