@@ -6,8 +6,8 @@ is repeated with few grains, many grains and a mass ratio of 100. Every method s
 steady states on until the standard errors of pressure and shear stress are at most ``PRECISION``,
 that of the reference included, or until one of them is wrong beyond doubt, or until its time is up
 (``SECONDS``). One criterion holds: an average is right if it is within ``RIGHT`` of the reference.
-Where the time is up it is right or wrong only if the interval of two standard errors is, and
-otherwise undecided.
+Where its standard error is larger than ``PRECISION`` it is right or wrong only if the interval of
+two standard errors is, and otherwise undecided.
 The reference is the Gauss–Seidel loop of ``independent.contact_dynamics``, which shares no code
 with jaxgran, at a time step and a tolerance far below those of the methods. For the force ratio,
 which depends on the time step in dense flows, its time step is shorter still.
@@ -463,9 +463,9 @@ def cell_of(row: dict, names: Sequence[str]) -> tuple[str, str]:
         return "runs", WRONG_WARNED if warned else UNKNOWN
     error, noise = max(errors, key=lambda pair: abs(pair[0]))
     text = f"{100 * error:+.0f}" if abs(error) >= 0.0995 else f"{100 * error:+.1f}"
-    if row["failure"]:
+    if not noise <= PRECISION:
         text += f"±{100 * noise:.2g}"
-        if not math.isfinite(noise) or abs(abs(error) - RIGHT) < 2 * noise:
+        if not abs(abs(error) - RIGHT) >= 2 * noise:
             return text, FAILED
     colours = (WRONG_SILENT, WRONG_WARNED), (RIGHT_OK, RIGHT_WARNED)
     return text, colours[abs(error) <= RIGHT][warned]
