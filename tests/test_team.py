@@ -23,7 +23,6 @@ import jaxgran as jg
 from jaxgran.dynamics import engine
 from jaxgran.dynamics.numba_engine import call, ffi, layout
 from jaxgran.dynamics.numba_engine.call import call_numba, first_row
-from jaxgran.dynamics.numba_engine.compilation import njit
 from jaxgran.dynamics.numba_engine.team import handler, linking
 from jaxgran.dynamics.numba_engine.team.memory import memory_at, words_needed
 from jaxgran.dynamics.tally import NUMBERS, place_of
@@ -169,17 +168,9 @@ def test_a_number_that_is_not_finite_is_a_status() -> None:
 
 @pytest.mark.parametrize(("grains", "lanes"), [(2, 32), (255, 1), (1000, 32)])
 def test_the_memory_of_a_team_holds_its_arrays(grains: int, lanes: int) -> None:
-    end = njit(lambda at, count, lanes: memory_at(at, count, lanes)[1])
-    end.compile(numba.types.int64(*[numba.types.int64] * 3))
-    (made,) = end.overloads.values()
-    library, name = made.library, made.fndesc.llvm_func_name
-    result, exception = ctypes.c_int64(), ctypes.c_void_p()
-    run = ctypes.CFUNCTYPE(ctypes.c_int32, *[ctypes.c_void_p] * 2, *[ctypes.c_int64] * 3)(
-        library.get_pointer_to_function(name)
-    )
-    run(ctypes.addressof(result), ctypes.addressof(exception), 0, grains, lanes)
+    end = numba.njit(lambda at, count, lanes: memory_at(at, count, lanes)[1])(0, grains, lanes)
     slots = 16 * lanes  # a whole and a real number of each
-    assert result.value + slots <= 8 * words_needed(grains, lanes) < result.value + slots + 512
+    assert end + slots <= 8 * words_needed(grains, lanes) < end + slots + 512
 
 
 def test_the_kernel_needs_nothing_but_the_device() -> None:

@@ -61,9 +61,7 @@ def solve_cluster(m, target, max_steps, grains, network, clusters):
             iterations += more
             for c in range(size):
                 rows[c].impulse = iterate[c].best
-        status = OK if squared_residual <= target else INFEASIBLE if jammed else ITERATION_LIMIT
-        if not squared_residual < math.inf:
-            status = NONFINITE
+        status = status_of(squared_residual, target, jammed)
     for c in range(size):
         impulses[IMPULSE, places[c]] = rows[c].impulse
     return iterations, squared_residual, status
@@ -87,6 +85,14 @@ def _take_contacts(start, size, grains, network, clusters):
         if n >= last:
             begin += one
             n = np.uint64(start) + begin
+
+
+@njit
+def status_of(squared_residual, target, jammed):
+    """The status of a solve that ends with a squared residual."""
+    if not squared_residual < math.inf:
+        return NONFINITE
+    return OK if squared_residual <= target else INFEASIBLE if jammed else ITERATION_LIMIT
 
 
 @njit
@@ -172,6 +178,18 @@ def relax(c, relaxation, rows, ends, dv):
 
 
 @njit
+def add_impulse(c, rows, ends, dv):
+    """Add the changes of velocity by the impulse of a contact."""
+    i, j, impulse = ends[c, FIRST], ends[c, SECOND], rows[c].impulse
+    per_mass_i = impulse * rows[c].inverse_mu_mi
+    per_mass_j = impulse * rows[c].inverse_mu_mj
+    dv[i, 0] += per_mass_i * rows[c].mu_nx
+    dv[i, 1] += per_mass_i * rows[c].mu_ny
+    dv[j, 0] -= per_mass_j * rows[c].mu_nx
+    dv[j, 1] -= per_mass_j * rows[c].mu_ny
+
+
+@njit
 def error_of(c, rows, ends, dv):
     """The part of a contact in the residual."""
     mu_velocity = mu_response_of(c, rows, ends, dv) + rows[c].mu_u
@@ -207,13 +225,7 @@ def descend(size, target, max_iterations, clusters):
             rows[c].impulse = new_impulse
             dv[i, 0] = dv[i, 1] = dv[j, 0] = dv[j, 1] = 0.0
         for c in range(size):
-            i, j, impulse = ends[c, FIRST], ends[c, SECOND], rows[c].impulse
-            per_mass_i = impulse * rows[c].inverse_mu_mi
-            per_mass_j = impulse * rows[c].inverse_mu_mj
-            dv[i, 0] += per_mass_i * rows[c].mu_nx
-            dv[i, 1] += per_mass_i * rows[c].mu_ny
-            dv[j, 0] -= per_mass_j * rows[c].mu_nx
-            dv[j, 1] -= per_mass_j * rows[c].mu_ny
+            add_impulse(c, rows, ends, dv)
         # with the last step s: sᵀWs, sᵀDs and (Ws)ᵀD⁻¹(Ws)
         squared_residual = curvature = squared_step = squared_response = 0.0
         for c in range(size):

@@ -74,8 +74,8 @@ from jaxgran.dynamics.velocity_scales import READ_AFTER
 image_in_cell, remap_tilt = CELL["image_in_cell"], CELL["remap_tilt"]
 
 # Expected within the skin: wide lists cost the events, narrow ones the searches
-PAIRS_PER_GRAIN = 2.7
-NARROWEST_SKIN = 0.05  # σ, the usual skin of a dense flow
+_PAIRS_PER_GRAIN = 2.7
+_NARROWEST_SKIN = 0.05  # σ, the usual skin of a dense flow
 
 
 @njit
@@ -114,15 +114,7 @@ def time_loop(
         status ``failed``.
     """
     side, shear_rate, dt = inputs.side, inputs.shear_rate, inputs.timestep
-    flow = Flow(
-        side,
-        shear_rate,
-        dt,
-        inputs.activation,
-        1.0 + inputs.restitution,
-        inputs.tolerance,
-        whole_part(inputs.max_steps, MANY),
-    )
+    flow = flow_of(inputs)
     look_ahead, count = flow.activation * dt, radii.size
     blocks, all_steps = steps.size, 0
     for b in range(blocks):
@@ -144,8 +136,7 @@ def time_loop(
     widest_skin = side / 2 - largest_diameter  # nearest images are unique
     if widest_skin < 0.0:
         status, widest_skin = max(status, CAPACITY), 0.0
-    expected_skin = math.sqrt(2 * PAIRS_PER_GRAIN * side * side / (math.pi * count)) - 1.0
-    usual_skin = min(max(expected_skin, NARROWEST_SKIN), widest_skin)
+    usual_skin = skin_of_a_list(side, count, widest_skin)
 
     life = LIFE / shear_rate if shear_rate > 0.0 else math.inf
     room, recorded = records.shape[0], 0
@@ -272,6 +263,27 @@ def time_loop(
     sums = results[blocks - 1]
     sums[TILT], sums[UNFINISHED], sums[RECORDED] = tilt, unfinished, recorded
     sums[SOLVED], sums[READ] = solved, reading_interval
+
+
+@njit
+def flow_of(inputs):
+    """The numbers of a flow that do not change."""
+    return Flow(
+        inputs.side,
+        inputs.shear_rate,
+        inputs.timestep,
+        inputs.activation,
+        1.0 + inputs.restitution,
+        inputs.tolerance,
+        whole_part(inputs.max_steps, MANY),
+    )
+
+
+@njit
+def skin_of_a_list(side, count, widest_skin):
+    """The skin within which a list is expected to have ``_PAIRS_PER_GRAIN``."""
+    expected_skin = math.sqrt(2 * _PAIRS_PER_GRAIN * side * side / (math.pi * count)) - 1.0
+    return min(max(expected_skin, _NARROWEST_SKIN), widest_skin)
 
 
 @njit

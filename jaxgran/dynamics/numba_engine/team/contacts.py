@@ -18,10 +18,12 @@ from numba.extending import intrinsic
 from jaxgran.dynamics.numba_engine.cluster_solver import (
     RELAXATION,
     SWEEPS,
+    add_impulse,
     descend,
     error_of,
     is_jammed,
     relax,
+    status_of,
     take_contact,
 )
 from jaxgran.dynamics.numba_engine.collisions import strike_grain
@@ -31,9 +33,6 @@ from jaxgran.dynamics.numba_engine.layout import (
     EPSILON,
     FIRST,
     IMPULSE,
-    INFEASIBLE,
-    ITERATION_LIMIT,
-    NONFINITE,
     NX,
     NY,
     OK,
@@ -256,24 +255,13 @@ def _go_on(team, size, target, sweeps, squared_residual, max_steps, clusters):
                 for end in range(2):
                     dv[ends[n, end], 0] = dv[ends[n, end], 1] = 0.0
             for n in range(size):
-                i, j, impulse = ends[n, FIRST], ends[n, SECOND], rows[n].impulse
-                per_mass_i = impulse * rows[n].inverse_mu_mi
-                per_mass_j = impulse * rows[n].inverse_mu_mj
-                dv[i, 0] += per_mass_i * rows[n].mu_nx
-                dv[i, 1] += per_mass_i * rows[n].mu_ny
-                dv[j, 0] -= per_mass_j * rows[n].mu_nx
-                dv[j, 1] -= per_mass_j * rows[n].mu_ny
+                add_impulse(n, rows, ends, dv)
         team.real[0] = squared_residual
         team.whole[0] = 2 * sweeps + (1 if jammed else 0)
     sync()
     squared_residual, both = team.real[0], team.whole[0]
     sync()
-    status = OK
-    if not squared_residual <= target:
-        status = INFEASIBLE if both % 2 == 1 else ITERATION_LIMIT
-    if not squared_residual < math.inf:
-        status = NONFINITE
-    return both // 2, squared_residual, status
+    return both // 2, squared_residual, status_of(squared_residual, target, both % 2 == 1)
 
 
 @njit

@@ -34,9 +34,8 @@ from jaxgran.dynamics.numba_engine.layout import (
     STATUS,
     STRIKES,
     TILT,
-    Flow,
 )
-from jaxgran.dynamics.numba_engine.loop import NARROWEST_SKIN, PAIRS_PER_GRAIN
+from jaxgran.dynamics.numba_engine.loop import flow_of, skin_of_a_list
 from jaxgran.dynamics.numba_engine.motion import (
     bring_grain_into_cell,
     move_grain,
@@ -97,15 +96,7 @@ def advance_team(
       memory: ``memory.Memory``, which needs not be initialised.
     """
     side, shear_rate, dt = inputs.side, inputs.shear_rate, inputs.timestep
-    flow = Flow(
-        side,
-        shear_rate,
-        dt,
-        inputs.activation,
-        1.0 + inputs.restitution,
-        inputs.tolerance,
-        whole_part(inputs.max_steps, MANY),
-    )
+    flow = flow_of(inputs)
     grains, pairs, network, clusters = memory.grains, memory.pairs, memory.network, memory.clusters
     look_ahead, count, sums = flow.activation * dt, radii.size, memory.sums[team.lane]
     blocks, all_steps = steps.size, 0
@@ -131,8 +122,7 @@ def advance_team(
     widest_skin = side / 2 - largest_diameter  # nearest images are unique
     if widest_skin < 0.0:
         status, widest_skin = max(status, CAPACITY), 0.0
-    expected_skin = math.sqrt(2 * PAIRS_PER_GRAIN * side * side / (math.pi * count)) - 1.0
-    usual_skin = min(max(expected_skin, NARROWEST_SKIN), widest_skin)
+    usual_skin = skin_of_a_list(side, count, widest_skin)
 
     life = LIFE / shear_rate if shear_rate > 0.0 else math.inf
     while steps_before_list < all_steps and status < NONFINITE:
