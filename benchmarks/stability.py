@@ -44,7 +44,7 @@ from benchmarks.peers.problem import Flow, Run, Stress, averages, relative
 from jaxgran.environment import usable_cores
 from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, empty_figure, styled
 from jaxgran.sampling.averages import averages as averages_of_sums
-from jaxgran.sampling.timestep import DEEPEST_OVERLAP, mean_gap
+from jaxgran.sampling.timestep import deepest_overlap
 
 RIGHT = 0.05  # relative error of an average
 PRECISION = 0.01  # relative standard error, that of the reference included
@@ -281,7 +281,7 @@ def measured(
     if tallies:
         total = sum(tallies[1:], start=tallies[0])
         mean = float(total.overlap / max(total.contacts, 1))
-        deep = mean > DEEPEST_OVERLAP * mean_gap(case.packing_fraction)
+        deep = mean > deepest_overlap(case.packing_fraction, case.grains)
         row |= {"status": "deep_overlap" if deep else "ok", "mean_overlap": mean}
         row["largest_overlap"] = float(total.largest_overlap)
     if blocks and right is not None:

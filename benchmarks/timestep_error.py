@@ -22,7 +22,7 @@ from benchmarks.output import Output
 from benchmarks.timestep_study import START, samples_by_timestep
 from jaxgran.environment import usable_cores
 from jaxgran.sampling.sample import estimates
-from jaxgran.sampling.timestep import DEEPEST_OVERLAP, mean_gap, stress_error
+from jaxgran.sampling.timestep import deepest_overlap, stress_error
 
 RELAXATION = 2.0  # strain at a new time step before its sample
 ALLOWED = 0.03  # relative error of the pressure that has to be foretold
@@ -68,11 +68,11 @@ def run(output: Output) -> None:
     output.write_rows("timestep_error", {"plan": plan._asdict()}, "rows", rows)
 
 
-def verdicts(rows: Sequence[Mapping]) -> dict:
+def verdicts(rows: Sequence[Mapping], grains: int) -> dict:
     """Which samples are off, and which of them ``deep_overlap`` flags, for the page of errors."""
 
     def flagged(row: Mapping) -> bool:
-        return row["mean_overlap"] / mean_gap(row["packing_fraction"]) > DEEPEST_OVERLAP
+        return row["mean_overlap"] > deepest_overlap(row["packing_fraction"], grains)
 
     def bound(row: Mapping) -> float:
         crossing = row["timestep"] * np.sqrt(row["temperature"])

@@ -44,7 +44,7 @@ MEANINGS = {
     "small",
     "not_steady": "temperature, pressure or total momentum still drifted, sample longer, or "
     "prepare longer by `equilibrate`",
-    "deep_overlap": "contacts overlap by more than 2 % of the mean gap between grains on average, "
+    "deep_overlap": "contacts overlap by more than 2 % of the gap between grains on average, "
     "so that the pressure may be off by more than 3 %, take a shorter time step",
     "infeasible": "no impulses satisfy the contact law, the packing is jammed, lower the packing "
     "fraction",

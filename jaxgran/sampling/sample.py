@@ -21,7 +21,7 @@ from jaxgran.model.values import Indexable, in_numpy
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.correlation_strain import flow_correlation_strain, mass_of_grains
 from jaxgran.sampling.observables import OBSERVABLES, Observables
-from jaxgran.sampling.timestep import DEEPEST_OVERLAP, mean_gap, stress_error
+from jaxgran.sampling.timestep import deepest_overlap, stress_error
 from jaxgran.statistics import (
     Estimates,
     correlation_length,
@@ -139,10 +139,10 @@ class Sample(Observables, Indexable):
     def status(self) -> Int[Array | np.ndarray, "*replicas"]:
         """The worst status: ``short_sample`` below four correlation strains, ``not_steady`` if the
         total momentum has become a part of the averages, ``deep_overlap`` if contacts overlap by
-        more than ``DEEPEST_OVERLAP`` of the mean gap between grains on average.
+        more than ``deepest_overlap`` on average.
         """
-        total, gap = self._total, mean_gap(in_numpy(self.flow).packing_fraction)
-        deep = total.overlap > DEEPEST_OVERLAP * gap * total.contacts
+        total, flow = self._total, in_numpy(self.flow)
+        deep = total.overlap > deepest_overlap(flow.packing_fraction, flow.grains) * total.contacts
         status = worse(total.status, deep, Status.deep_overlap)
         return worse(status, total.momentum_drift > LARGEST_DRIFT, Status.not_steady)
 
