@@ -6,6 +6,7 @@ The picture of a single flow (``flow``) keeps no result, so its benchmark draws 
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import pandas as pd
 from matplotlib.figure import Figure
 
 from benchmarks import (
@@ -27,7 +28,7 @@ from jaxgran.theory.corrected_shear import MEASURED_LAWS
 
 PICTURES: dict[str, Callable[[], Figure]] = {
     "dissipation": lambda: dissipation.draw(
-        *(dissipation.of_rows(read("dissipation")[name]) for name in ("points", "judged_points")),
+        *(pd.DataFrame(read("dissipation")[name]) for name in ("points", "judged_points")),
         MEASURED_LAWS,
     ),
     "size_study": lambda: size_figures.draw_sizes(read("size_study")["flows"]),

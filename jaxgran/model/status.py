@@ -44,8 +44,8 @@ MEANINGS = {
     "small",
     "not_steady": "temperature, pressure or total momentum still drifted, sample longer, or "
     "prepare longer by `equilibrate`",
-    "deep_overlap": "contacts overlap by more than 2 % of the gap between grains on average, "
-    "so that the pressure may be off by more than 3 %, take a shorter time step",
+    "deep_overlap": "contacts overlap by too large a part of the gap between grains, so that the "
+    "pressure may be off by more than 3 %, take a shorter time step",
     "infeasible": "no impulses satisfy the contact law, the packing is jammed, lower the packing "
     "fraction",
     "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",
