@@ -24,9 +24,9 @@ import jaxgran as jg
 from benchmarks.independent import contact_dynamics
 from benchmarks.output import Output
 from benchmarks.step_cost import rival_arguments
-from jaxgran.dynamics.batching import in_lockstep
 from jaxgran.dynamics.engine import Numerics, engine_named, select_engine
 from jaxgran.dynamics.numba_engine.team.handler import MOST_GRAINS
+from jaxgran.environment import on_processor
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.observe import advance_batch
 
@@ -41,7 +41,7 @@ TURNS, ENOUGH_SECONDS = 3, 60
 def run(output: Output, engine: str = "auto") -> None:
     """Compare every batch at every point, print, and write JSON after each."""
     numerics = Numerics(engine=engine_named(engine))
-    batches, points = BATCHES + (ACCELERATOR_BATCHES if in_lockstep() else ()), POINTS
+    batches, points = BATCHES + (() if on_processor() else ACCELERATOR_BATCHES), POINTS
     if engine == "numba":
         batches = tuple(batch for batch in batches if batch[1] <= MOST_GRAINS)
     if output.quick:

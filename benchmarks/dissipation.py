@@ -1,4 +1,4 @@
-"""How far Enskog's dissipation rate is from the measured one, and the theory that a law of it mends.
+"""How far Enskog's dissipation rate is from the measured one, and what a law of it mends.
 
 From the reference map: the dissipation rate Γ over Enskog's Γ_E at the measured temperature tensor,
 scaled to the local temperature; and the lengths L = Γ_E/Γ and L′ = (Γ_E/p_E)/(Γ/p) with contact

@@ -27,9 +27,8 @@ from benchmarks.output import RESULTS, ROOT
 from benchmarks.peers import front
 from jaxgran.maps.automatic import chosen_settings
 from jaxgran.maps.results import open_map
-from jaxgran.maps.schema import flattened, shear_stress_ratio
+from jaxgran.maps.schema import shear_stress_ratio
 from jaxgran.model.display import with_error
-from jaxgran.plotting.factors import CURVES, PREFIX, with_temperature
 from jaxgran.reference.validity import validity
 from jaxgran.sampling.budget import SIZE_LAWS
 from jaxgran.theory.assumptions import ASSUMPTIONS
@@ -132,16 +131,6 @@ def point(file: str, name: str, restitution: float, packing_fraction: float) -> 
     return float(data[variable].sel(chosen)), error
 
 
-def factors(file: str, restitution: float, packing_fraction: float) -> list[float]:
-    """The factors of the theory's contact pressure at a point of a map, in the order of the figure,
-    and their product.
-    """
-    data = with_temperature(flattened(_map(file)))
-    chosen = data.sel(restitution=restitution, packing_fraction=packing_fraction)
-    values = [float(chosen[f"{PREFIX}{name}"]) for name in CURVES]
-    return [*values, math.prod(values)]
-
-
 def shear_stress_ratio_at(
     file: str, restitution: float, packing_fraction: float
 ) -> tuple[float, float]:
@@ -227,13 +216,13 @@ ENVIRONMENT.filters |= {
 }
 ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table}
 ENVIRONMENT.globals |= {"ASSUMPTIONS": ASSUMPTIONS, "timestep_verdicts": timestep_error.verdicts}
-ENVIRONMENT.globals |= {"FACTOR_CURVES": CURVES, "SIZE_LAWS": SIZE_LAWS}
+ENVIRONMENT.globals |= {"SIZE_LAWS": SIZE_LAWS}
 ENVIRONMENT.globals |= {
     function.__name__: function
     for function in (
         *(max, at, fastest_loop, point, quotients, validity),
         *(sig, percent, percent_pm, pm, duration),
-        *(factors, grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where),
+        *(grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where),
     )
 }
 ENVIRONMENT.globals |= {

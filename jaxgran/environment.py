@@ -93,6 +93,15 @@ def default_device() -> Any:
     return jax.devices(device)[0] if device is None or isinstance(device, str) else device
 
 
+def on_processor() -> bool:
+    """Whether JAX computes on a processor by default, and not on an accelerator.
+
+    On a processor each replica of a batch advances by itself. On an accelerator the engine ``Jax``
+    advances a batch in lockstep, as one array program that waits for its slowest replica.
+    """
+    return default_device().platform == "cpu"
+
+
 def precision() -> str:
     """JAX's default floating-point type: float64 or float32."""
     import jax.numpy as jnp

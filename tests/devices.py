@@ -14,12 +14,11 @@ from jax.sharding import Mesh, PartitionSpec
 from test_batching import assert_same
 
 import jaxgran as jg
-from jaxgran.dynamics import batching, engine
+from jaxgran import environment
 
 jax.config.update("jax_enable_x64", True)
 if sys.argv[1:] == ["lockstep"]:
-    for module in (batching, engine):
-        module.default_device = lambda: SimpleNamespace(platform="accelerator")
+    environment.default_device = lambda: SimpleNamespace(platform="accelerator")
 
 alphas = jnp.asarray([0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.2, 0.4])
 flows = flow_of(0.7, restitution=alphas)

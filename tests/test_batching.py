@@ -17,7 +17,7 @@ from jax.sharding import Mesh, PartitionSpec
 from synthetic import refused
 
 import jaxgran as jg
-from jaxgran.dynamics import batching, engine
+from jaxgran import environment
 from jaxgran.dynamics.advance import advance
 
 ALPHAS, STEPS = jnp.asarray([0.3, 0.5, 0.9]), 20
@@ -85,10 +85,8 @@ def test_lockstep_has_the_bits_of_each_replica_alone_and_lowers_for_every_accele
 ) -> None:
     alone_of = compiled(partial(advanced, jg.Jax()))
     alone = [alone_of(alpha, replica(states, k)) for k, alpha in enumerate(ALPHAS)]
-    for module in (batching, engine):
-        monkeypatch.setattr(
-            module, "default_device", lambda: SimpleNamespace(platform="accelerator")
-        )
+    accelerator = SimpleNamespace(platform="accelerator")
+    monkeypatch.setattr(environment, "default_device", lambda: accelerator)
     run = jax.vmap(
         lambda alpha, state: advance(
             replace(flow_of(0.7), restitution=alpha), state, jnp.int32(STEPS)

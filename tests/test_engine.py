@@ -15,9 +15,9 @@ from test_batching import compiled
 
 import jaxgran as jg
 from jaxgran.contact.projected_methods import solver_name
-from jaxgran.dynamics.batching import in_lockstep
 from jaxgran.dynamics.engine import Numerics, _warn_once, select_engine
 from jaxgran.dynamics.jax_engine import advance_by_jax
+from jaxgran.environment import on_processor
 from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.settings import MapSettings
@@ -179,7 +179,7 @@ def test_the_default_device_chooses_the_engine_not_the_backend(flowing, monkeypa
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     flows, states = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), (of(), flowing(0.7)))
     with jax.default_device(jax.devices("cpu")[0]):
-        assert not in_lockstep()
+        assert on_processor()
         _, tally = jg.advance(flows, states, STEPS, engine=jg.Numba())
     assert np.all(np.asarray(tally.steps) == int(STEPS))
 

@@ -224,7 +224,7 @@ def test_few_replicas_on_an_accelerator_are_told_that_a_processor_is_faster(
     settings, run = MapSettings(**SETTINGS), RunOptions(progress=True)
     ratio_map_module.settle(settings, run, "")
     assert few not in capsys.readouterr().err
-    monkeypatch.setattr(ratio_map_module, "in_lockstep", lambda: True)
+    monkeypatch.setattr(ratio_map_module, "on_processor", lambda: False)
     ratio_map_module.settle(settings, run, "")
     assert few in capsys.readouterr().err
     ratio_map_module.settle(replace(settings, seeds=500), run, "")

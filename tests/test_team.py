@@ -20,6 +20,7 @@ import team_on_processor
 from synthetic import refused
 
 import jaxgran as jg
+from jaxgran import environment
 from jaxgran.dynamics import engine
 from jaxgran.dynamics.numba_engine import call, ffi, layout
 from jaxgran.dynamics.numba_engine.call import call_numba, first_row
@@ -227,8 +228,7 @@ def device(monkeypatch):
     monkeypatch.setattr(handler, "kept_ptx", lambda: "code")
     handler.kernel.cache_clear()
     monkeypatch.setattr(handler, "call_xla", call_xla)
-    for module in (call, engine):
-        monkeypatch.setattr(module, "default_device", lambda: SimpleNamespace(platform="gpu"))
+    monkeypatch.setattr(environment, "default_device", lambda: SimpleNamespace(platform="gpu"))
     monkeypatch.setattr(call, "register", lambda: None)
     monkeypatch.setattr(ffi, "TARGET", f"jaxgran_acted_{next(TARGETS)}")
     handler.register_handler(ffi.TARGET, "cpu", handler.launch_on_stream)

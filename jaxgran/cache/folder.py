@@ -10,7 +10,7 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
-from jaxgran.environment import default_device
+from jaxgran.environment import on_processor
 
 _SHORTEST_COMPILATION = 0.3  # seconds; faster compilations are not cached
 
@@ -36,7 +36,7 @@ def use_cache() -> None:
         config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST_COMPILATION)
         level = flags["jax_logging_level"]
         unset = level in (None, "NOTSET") and os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1"
-        if unset and default_device().platform == "cpu":
+        if unset and on_processor():
             # XLA logs a harmless error for each program that it loads, as it takes tuning hints for
             # instruction sets. JAX sets the level of its log with its own, but does not set it back
             config.update("jax_logging_level", "CRITICAL")

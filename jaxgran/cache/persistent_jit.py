@@ -22,7 +22,7 @@ from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
 from jaxgran.cache.folder import programs_folder
-from jaxgran.environment import default_device, processor, versions
+from jaxgran.environment import on_processor, processor, versions
 from jaxgran.files import atomic_write, file_lock, keep_newest
 
 _MOST_PROGRAMS = 64  # of up to 4 MB each
@@ -47,7 +47,7 @@ def persistent_jit(function: Callable, register: Callable[[], None] = lambda: No
     def call(*arguments: Any) -> Any:
         folder = programs_folder()
         leaves, structure = jax.tree.flatten(arguments)
-        elsewhere = default_device().platform != "cpu" or jax.device_count() > 1
+        elsewhere = not on_processor() or jax.device_count() > 1
         traced = any(isinstance(leaf, Tracer) for leaf in leaves)
         if folder is None or elsewhere or traced or not _is_ours(structure):
             return jitted(*arguments)

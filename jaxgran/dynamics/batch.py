@@ -26,10 +26,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
-from jaxgran.dynamics.batching import in_lockstep
 from jaxgran.dynamics.engine import Numba, Numerics, select_engine
 from jaxgran.dynamics.interruption import PATIENCE, block_until_done, engines_stopped
-from jaxgran.environment import usable_threads
+from jaxgran.environment import on_processor, usable_threads
 from jaxgran.model.checks import InputError, is_traced
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
@@ -118,7 +117,7 @@ def over_replicas(function: Callable[..., T], numerics: Numerics, batch: Argumen
     """The function of one replica for a batch that JAX may trace: by ``vmap``, which advances the
     replicas as they do best, or in turn where the engine ``Jax`` takes a processor.
     """
-    if isinstance(select_engine(numerics, batch[1]), Numba) or in_lockstep():
+    if isinstance(select_engine(numerics, batch[1]), Numba) or not on_processor():
         return jax.vmap(function)(*batch)
     return lax.map(lambda replica: function(*replica), batch)
 
@@ -159,7 +158,7 @@ def run_batch(
       costs: relative cost of each replica. Threads begin with the most expensive ones.
       threads: most threads on a processor.
     """
-    if in_lockstep():
+    if not on_processor():
         return block_until_done(_together(function, static, shared, batch))
     replicas = list(replicas_of(batch))
 

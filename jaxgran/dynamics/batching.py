@@ -10,18 +10,9 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
-from jaxgran.environment import default_device
+from jaxgran.environment import on_processor
 
 T = TypeVar("T")
-
-
-def in_lockstep() -> bool:
-    """Whether the replicas of a batch advance together, as one array program that waits for its
-    slowest replica.
-
-    They do on an accelerator. On a processor each advances by itself, which is faster.
-    """
-    return default_device().platform != "cpu"
 
 
 def with_own_batching(function: Callable[..., T]) -> Callable[..., T]:
@@ -44,11 +35,11 @@ def with_own_batching(function: Callable[..., T]) -> Callable[..., T]:
 
         @in_turn.def_vmap
         def _(size: int, is_batched: list, *arguments: Any) -> tuple[T, Any]:
-            if in_lockstep():
+            if on_processor():
+                result = _map(in_turn, arguments, is_batched)
+            else:
                 axes = jax.tree.map(lambda batched: 0 if batched else None, tuple(is_batched))
                 result = jax.vmap(with_constants, axes)(*arguments)
-            else:
-                result = _map(in_turn, arguments, is_batched)
             return result, jax.tree.map(lambda _: True, result)
 
         return in_turn(traced.consts, *arguments)

@@ -28,7 +28,7 @@ from jaxgran.dynamics.numba_engine.observed import advance_by_numba
 from jaxgran.dynamics.numba_engine.team.handler import MOST_GRAINS, has_cuda
 from jaxgran.dynamics.observer import Observe, uses_traced_values
 from jaxgran.dynamics.tally import Tally
-from jaxgran.environment import default_device, precision
+from jaxgran.environment import default_device, on_processor, precision
 from jaxgran.model.checks import InputError, refused, require_flag, require_whole
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.flow import ShearFlow
@@ -154,7 +154,7 @@ class Numba:
         """As ``Jax.advance``; the list of near pairs outlives a block, where nothing is
         observed.
         """
-        if default_device().platform != "cpu":
+        if not on_processor():
             if observe is not None:
                 raise InputError(
                     "engine numba observes on a processor only: take jg.Jax() on a device."
@@ -230,7 +230,7 @@ def select_engine(numerics: Numerics, state: State | None = None) -> Engine:
             "state must be of the precision in which JAX computes, float32, not float64: begin "
             f"with {_ENABLE_X64}."
         )
-    engine = numerics.engine or (Numba() if default_device().platform == "cpu" else Jax())
+    engine = numerics.engine or (Numba() if on_processor() else Jax())
     wrong = engine.refuses(dtype, numerics.solver)
     if not wrong:
         return engine

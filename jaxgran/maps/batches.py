@@ -6,10 +6,8 @@ So no core is idle for long at the end. The numbers of a replica do not depend o
 from collections.abc import Sequence
 from heapq import heappop, heappush
 
-import jax
-
 from jaxgran.dynamics.batch import predicted_cost
-from jaxgran.dynamics.batching import in_lockstep
+from jaxgran.environment import default_device, on_processor
 from jaxgran.maps.replica import ReplicaId
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.flow import ShearFlow
@@ -68,14 +66,13 @@ def batches(settings: MapSettings, replicas: Sequence[ReplicaId]) -> list[list[R
     """Replicas in batches of one number of grains and of similar cost, the most expensive first."""
     costs = {point: predicted_cost(flow) for point, flow in settings.flows.items()}
     by_cost = sorted(replicas, key=lambda replica: -costs[replica.point])
-    lockstep = in_lockstep()
     tasks: list[list[ReplicaId]] = []
     for grains in {replica.grains: None for replica in replicas}:
         alike = [replica for replica in by_cost if replica.grains == grains]
         most, batch = batch_size(grains, len(alike)), []
         for replica in alike:
             least = costs[batch[0].point] / _LARGEST_COST_RATIO if batch else 0.0
-            if not batch or len(batch) == most or (lockstep and costs[replica.point] < least):
+            if not batch or len(batch) == most or costs[replica.point] < least:
                 batch = []
                 tasks.append(batch)
             batch.append(replica)
@@ -86,10 +83,9 @@ def batch_size(grains: int, count: int) -> int:
     """Replicas of a batch: one on a processor, as many as fit into half the memory of an
     accelerator.
     """
-    device = jax.local_devices()[0]
-    if device.platform == "cpu":
+    if on_processor():
         return 1
-    memory = (device.memory_stats() or {}).get("bytes_limit", _DEFAULT_MEMORY)
+    memory = (default_device().memory_stats() or {}).get("bytes_limit", _DEFAULT_MEMORY)
     per_replica = (
         _GRAIN_BYTES * max(64, 1 << (grains - 1).bit_length()) + _PAIR_BYTES * min(grains, 512) ** 2
     )

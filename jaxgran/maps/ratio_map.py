@@ -15,9 +15,8 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.contact.projected_methods import ProjectedMethod
-from jaxgran.dynamics.batching import in_lockstep
 from jaxgran.dynamics.engine import Engine
-from jaxgran.environment import usable_cores
+from jaxgran.environment import on_processor, usable_cores
 from jaxgran.maps.automatic import chosen_settings, expected_costs, expected_seconds
 from jaxgran.maps.batches import replica_ids
 from jaxgran.maps.cluster import Provenance
@@ -190,7 +189,7 @@ def settle(settings: MapSettings, run: RunOptions, automatic_choice: str) -> Run
     if automatic_choice:
         run.tell(f"chosen: {automatic_choice}")
     count = len(replica_ids(settings))
-    if in_lockstep() and count < _FEW_ON_AN_ACCELERATOR:
+    if not on_processor() and count < _FEW_ON_AN_ACCELERATOR:
         run.tell(
             f"{count} replicas are few for an accelerator; a processor may "
             "be faster: set JAX_PLATFORMS=cpu."
@@ -210,7 +209,7 @@ def _run_missing(
     missing = [x for x in replica_ids(settings) if x not in done]
     workers, start = min(len(missing) or 1, run.workers or 1), perf_counter()
     resumed, made, interruption = len(done), Provenance(), None
-    costs, known = expected_costs(settings), not in_lockstep() and run.scheduler is None
+    costs, known = expected_costs(settings), on_processor() and run.scheduler is None
     expected = expected_seconds(settings, costs) / workers if known else math.inf
     keeping = None if run.record else store
     with progress(settings, costs, run.progress is not True, expected) as meter:
@@ -281,10 +280,10 @@ def _require_own_attributes(run: RunOptions, settings: MapSettings) -> None:
 
 def _workers(run: RunOptions) -> int:
     """How many batches run at a time; InputError if they cannot."""
-    on_cpu = not in_lockstep()
     if run.workers is None:
-        return usable_cores() if on_cpu and run.scheduler is None and run.record is None else 1
-    if run.workers > 1 and not on_cpu:
+        alone = run.scheduler is None and run.record is None
+        return usable_cores() if on_processor() and alone else 1
+    if run.workers > 1 and not on_processor():
         raise refused("workers", run.workers, "must be 1 on an accelerator")
     return run.workers
 

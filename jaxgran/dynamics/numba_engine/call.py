@@ -12,7 +12,7 @@ from jaxgran.dynamics.jax_engine import end_of_advance
 from jaxgran.dynamics.numba_engine import ffi, layout
 from jaxgran.dynamics.numba_engine.team import handler
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally
-from jaxgran.environment import default_device
+from jaxgran.environment import on_processor
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State, kinetic_energy, status_at_start
@@ -62,7 +62,7 @@ def register() -> None:
     Raises:
       InputError: see ``ffi.register``.
     """
-    if default_device().platform == "cpu":
+    if on_processor():
         ffi.register()
     else:
         handler.register()
@@ -110,7 +110,7 @@ def call_numba(
     register()
     dtype, grains = state.positions.dtype, state.grains
     records = (room, layout.record_numbers(flow.grains))
-    if default_device().platform != "cpu":
+    if not on_processor():
         records = (1, handler.words_of_memory(flow.grains))
     inputs = layout.Inputs(
         side=state.side,
