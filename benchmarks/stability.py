@@ -429,42 +429,46 @@ def peer_run(peer: Any, case: Case, setting: float, state: jg.State) -> Run:
 # ----------------------------------------------------------------------------------------------
 # figure
 
+OF_TWO, OF_THREE = 0.27, 0.38  # inches: height of a row with two or three lines of text
 # Colours of a cell, and what they say
 RIGHT_OK, RIGHT_WARNED, WRONG_WARNED, WRONG_SILENT, FAILED, UNKNOWN = (
     *("#d9e6d2", "#fff2b3", "#f7c77f", "#d7301f", "#d9d9d9", "white"),
 )
 MEANINGS = {
-    RIGHT_OK: f"within {RIGHT:.0%}",
+    RIGHT_OK: f"within {100 * RIGHT:.0f} %",
     RIGHT_WARNED: "within, status deep_overlap",
     WRONG_WARNED: "wrong, status deep_overlap",
     WRONG_SILENT: "wrong, no status",
     FAILED: "failed with a message, or undecided",
 }
-WORDS = {
-    EVENT_DRIVEN: "collapse",
-    SOFT: "gives up",
-    "too_slow": "slow",
-    "iteration_limit": "unsolved",
-    "infeasible": "jammed",
-    "nonfinite": "not finite",
+LETTERS = {
+    EVENT_DRIVEN: ("c", "inelastic collapse"),
+    SOFT: ("g", "gives up"),
+    "too_slow": ("s", "slow"),
+    "iteration_limit": ("u", "unsolved"),
+    "infeasible": ("j", "jammed"),
+    "nonfinite": ("n", "not finite"),
+    "runs": ("r", "runs, no reference"),
 }
+"""What stands in a cell without an error, and what it means."""
 
 
 def cell_of(row: dict, names: Sequence[str]) -> tuple[str, str]:
-    """Text and colour: the largest of the errors in per cent, or the word for a failure."""
+    """Text and colour: the largest of the errors in per cent, above a standard error of more than
+    ``PRECISION``, or the letter of a failure.
+    """
     if row["failure"] is not None and row["failure"] != "too_slow":
-        word = str(row["method"] if row["method"] in WORDS else row["failure"])
-        return WORDS.get(word, word), FAILED
+        return LETTERS[row["method"] if row["method"] in LETTERS else row["failure"]][0], FAILED
     errors = [row[name] for name in names if row.get(name)]
     warned = row["status"] == "deep_overlap"
     if not errors:
         if row["failure"]:
-            return WORDS["too_slow"], FAILED
-        return "runs", WRONG_WARNED if warned else UNKNOWN
+            return LETTERS["too_slow"][0], FAILED
+        return LETTERS["runs"][0], WRONG_WARNED if warned else UNKNOWN
     error, noise = max(errors, key=lambda pair: abs(pair[0]))
     text = f"{100 * error:+.0f}" if abs(error) >= 0.0995 else f"{100 * error:+.1f}"
     if not noise <= PRECISION:
-        text += f"±{100 * noise:.2g}"
+        text += f"\n±{100 * noise:.2g}"
         if not abs(abs(error) - RIGHT) >= 2 * noise:
             return text, FAILED
     colours = (WRONG_SILENT, WRONG_WARNED), (RIGHT_OK, RIGHT_WARNED)
@@ -474,7 +478,7 @@ def cell_of(row: dict, names: Sequence[str]) -> tuple[str, str]:
 @styled
 def draw(rows: list[dict]) -> Figure:
     """A table: methods and settings by flows."""
-    cases = list(dict.fromkeys(case_of(row) for row in rows))
+    cases = sorted({case_of(row) for row in rows}, key=[*FULL.cases, *QUICK.cases].index)
     lines = [
         (method, setting, STRESSES, title(method, setting))
         for method, (settings, _) in (PEERS | METHODS).items()
@@ -482,12 +486,14 @@ def draw(rows: list[dict]) -> Figure:
         if any(row["method"] == method for row in rows)
     ]
     lines += [
-        (DEFAULT, setting, ("force_ratio",), f"force ratio, {title(DEFAULT, setting)}")
+        (DEFAULT, setting, ("force_ratio",), f"force ratio, {title('', setting)}")
         for setting in TIMESTEPS
     ]
-    figure = empty_figure(TWO_COLUMNS, 0.9 + 0.29 * len(lines))
+    heights = [OF_THREE if line[::2] == (DEFAULT, STRESSES) else OF_TWO for line in lines]
+    edges = np.cumsum([0.0, *heights])
+    figure, letters = empty_figure(TWO_COLUMNS, 1.35 + edges[-1]), set()
     axes = figure.add_subplot()
-    for y, (method, setting, names, _) in enumerate(lines):
+    for (method, setting, names, _), top, height in zip(lines, edges, heights, strict=False):
         for x, case in enumerate(cases):
             row = next(
                 row
@@ -495,52 +501,49 @@ def draw(rows: list[dict]) -> Figure:
                 if case_of(row) == case and (row["method"], row["setting"]) == (method, setting)
             )
             text, colour = cell_of(row, names)
-            if method == DEFAULT and names == STRESSES and row["largest_overlap"] is not None:
-                text += f"\n{row['largest_overlap']:.2g} σ"
-            white = colour == WRONG_SILENT
-            axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
-            axes.text(
-                *(x, y, text),
-                ha="center",
-                va="center",
-                fontsize=SMALL_SIZE,
-                color="white" if white else "black",
-                linespacing=0.9,
-            )
-    axes.set(xlim=(-0.5, len(cases) - 0.5), ylim=(len(lines) - 0.5, -0.5))
+            letters.add(text)
+            if height == OF_THREE and row["largest_overlap"] is not None:
+                text += f"\n{row['largest_overlap']:.1g}"
+            look = {"facecolor": colour, "edgecolor": "white"}
+            axes.add_patch(Rectangle((x - 0.5, top), 1, height, **look))
+            look = {"color": "white" if colour == WRONG_SILENT else "black", "linespacing": 0.9}
+            at = {"ha": "center", "va": "center", "fontsize": SMALL_SIZE}
+            axes.text(x, top + height / 2, text, **at, **look)
+    axes.set(xlim=(-0.5, len(cases) - 0.5), ylim=(edges[-1], 0))
     axes.set_xticks(range(len(cases)), [name_of(case) for case in cases], fontsize=SMALL_SIZE)
-    axes.set_yticks(range(len(lines)), [words for *_, words in lines], fontsize=SMALL_SIZE)
+    words = [line[-1] for line in lines]
+    axes.set_yticks((edges[1:] + edges[:-1]) / 2, words, fontsize=SMALL_SIZE)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
     corner = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "bottom"}
-    axes.annotate("$\\alpha$\n$\\nu$", (0, 1), (-3, 4), ha="right", fontsize=SMALL_SIZE, **corner)
+    axes.annotate(
+        "$\\alpha$\n$\\nu$\n$N$", (0, 1), (-3, 4), ha="right", fontsize=SMALL_SIZE, **corner
+    )
     axes.spines[:].set_visible(False)
+    known = "; ".join(f"{x}: {meaning}" for x, meaning in LETTERS.values() if x in letters)
     figure.legend(
         handles=[Patch(color=colour, label=words) for colour, words in MEANINGS.items()],
         loc="outside lower center",
         ncols=3,
         fontsize=SMALL_SIZE,
-        title="error in %, and below it the largest overlap",
+        title=f"error in %, standard error above 1 %, largest overlap in σ; {known}",
         title_fontsize=SMALL_SIZE,
     )
     return figure
 
 
 def name_of(case: Case) -> str:
-    """α, ν and what else is not as in the other flows, one above the other."""
-    other = ""
-    if case.mass_ratio is not None:
-        other = f"\nmass 1:{case.mass_ratio:g}"
-    elif case.grains != FULL.cases[0].grains:
-        other = f"\nN={case.grains}"
-    return f"{case.restitution:g}\n{case.packing_fraction:g}{other}"
+    """α, ν and N, or a mass ratio in its place, one above the other."""
+    last = f"{case.grains}" if case.mass_ratio is None else f"1:{case.mass_ratio:g}"
+    return f"{case.restitution:g}\n{case.packing_fraction:g}\n{last}"
 
 
 def title(method: str, setting: float) -> str:
-    """A method with its setting."""
+    """A method with its setting, or the setting alone."""
     if setting == 0:
         return method
     mantissa, exponent = f"{setting:.0e}".split("e")
     number = (
         f"10^{{{int(exponent)}}}" if mantissa == "1" else rf"{mantissa}\times10^{{{int(exponent)}}}"
     )
-    return f"{method}, ${'k' if method == SOFT else 'dt'}={number}$".replace("dt", r"\mathrm{d}t")
+    name = "k" if method == SOFT else r"\mathrm{d}t"
+    return f"{method}{', ' if method else ''}${name}={number}$"
