@@ -12,8 +12,9 @@ The reference is the Gauss–Seidel loop of ``independent.contact_dynamics``, wh
 with jaxgran, at a time step and a tolerance far below those of the methods. For the force ratio,
 which depends on the time step in dense flows, its time step is shorter still.
 
-Beside each error stands the status that ``jg.sample`` gives such a sample. What is wrong without a
-status is a silent error; soft discs have no status, and so all their errors are silent.
+Beside each error stands the status that ``jg.sample`` gives such a sample, by its mean overlap.
+What is wrong without a status is a silent error; soft discs have no status, and so all their errors
+are silent.
 
     python -m benchmarks stability            # about two hours on two cores
     python -m benchmarks stability --quick    # two flows of 64 grains, about two minutes
@@ -177,7 +178,6 @@ def rows_of(plan: Plan, case: Case) -> tuple[dict, list[dict]]:
     fields of ``Case``       where
     method, setting    –     a key of ``METHODS`` or ``PEERS``; its dt in 1/γ̇ or k in mγ̇²
     failure            –     what ended the run: a status, "too_slow", or the words of a peer
-    status             –     of the sample, as ``jg.sample`` gives it; None by other programs
     strain             –     that was sampled, over all seeds
     seconds            s     of processor time
     largest_overlap    σ     of a contact, by contact dynamics, and the mean in ``mean_overlap``
@@ -195,7 +195,7 @@ def rows_of(plan: Plan, case: Case) -> tuple[dict, list[dict]]:
         row |= measured(plan, case, [partial(begin, state) for state in states], right)
         rows.append(row)
         print(
-            f"{case}  {method:20s}{setting:8.0e}  {row['failure'] or row['status'] or '':16.16s}"
+            f"{case}  {method:20s}{setting:8.0e}  {row['failure'] or status_of(row) or '':16.16s}"
             + "".join(
                 "{:8.1f} ± {:.1f} %".format(*(100 * x for x in row[name]))
                 for name in (*STRESSES, "force_ratio")
@@ -276,13 +276,11 @@ def measured(
     ]
     for one in runs:
         one.close()
-    row = {"failure": failure, "status": None, "seconds": seconds, "largest_overlap": None}
+    row = {"failure": failure, "seconds": seconds, "mean_overlap": None, "largest_overlap": None}
     row["strain"] = case.block * sum(map(len, blocks))
     if tallies:
         total = sum(tallies[1:], start=tallies[0])
-        mean = float(total.overlap / max(total.contacts, 1))
-        deep = mean > deepest_overlap(case.packing_fraction, case.grains)
-        row |= {"status": "deep_overlap" if deep else "ok", "mean_overlap": mean}
+        row["mean_overlap"] = float(total.overlap / max(total.contacts, 1))
         row["largest_overlap"] = float(total.largest_overlap)
     if blocks and right is not None:
         values = averages(blocks)
@@ -453,6 +451,16 @@ LETTERS = {
 """What stands in a cell without an error, and what it means."""
 
 
+def status_of(row: dict) -> str | None:
+    """The status of a sample, as ``jg.sample`` gives it; None by other programs, and without a
+    sample.
+    """
+    if row.get("mean_overlap") is None:
+        return None
+    deep = row["mean_overlap"] > deepest_overlap(row["packing_fraction"], row["grains"])
+    return "deep_overlap" if deep else "ok"
+
+
 def cell_of(row: dict, names: Sequence[str]) -> tuple[str, str]:
     """Text and colour: the largest of the errors in per cent, above a standard error of more than
     ``PRECISION``, or the letter of a failure.
@@ -460,7 +468,7 @@ def cell_of(row: dict, names: Sequence[str]) -> tuple[str, str]:
     if row["failure"] is not None and row["failure"] != "too_slow":
         return LETTERS[row["method"] if row["method"] in LETTERS else row["failure"]][0], FAILED
     errors = [row[name] for name in names if row.get(name)]
-    warned = row["status"] == "deep_overlap"
+    warned = status_of(row) == "deep_overlap"
     if not errors:
         if row["failure"]:
             return LETTERS["too_slow"][0], FAILED
