@@ -511,7 +511,7 @@ def draw(rows: list[dict]) -> Figure:
             text, colour = cell_of(row, names)
             letters.add(text)
             if height == OF_THREE and row["largest_overlap"] is not None:
-                text += f"\n{row['largest_overlap']:.1g}"
+                text += f"\n{row['largest_overlap']:.1g}".replace("0.", ".")
             look = {"facecolor": colour, "edgecolor": "white"}
             axes.add_patch(Rectangle((x - 0.5, top), 1, height, **look))
             look = {"color": "white" if colour == WRONG_SILENT else "black", "linespacing": 0.9}
