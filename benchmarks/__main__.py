@@ -1,155 +1,113 @@
-"""The command line of the benchmarks: lists them, or reads the options of one and runs it."""
+"""The command line of the benchmarks; it sets up JAX before anything imports it.
+
+python -m benchmarks                  # what there is
+python -m benchmarks NAME [--quick]   # one of them
+python -m benchmarks NAME --help      # what it measures, how long it takes, and its options
+python -m benchmarks all [--quick]    # one after the other
+python -m benchmarks draw [PICTURE …] # the figures of the committed results, without measuring
+"""
 
 import argparse
 import ast
+import inspect
+import os
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
-from benchmarks.process import ROOT, set_up
-from benchmarks.registry import BENCHMARKS, Benchmark
+from benchmarks import ROOT
 
-SHARED = ("name", "quick", "output", "replace")
+FOLDER = ROOT / "benchmarks"
+ONE_CORE = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """List the benchmarks, or run the one that is named."""
-    chosen = parser().parse_args(arguments)
-    if chosen.name is None:
-        print("\n".join(map(listing, BENCHMARKS)))
-        return
-    if chosen.name == "draw":
-        from benchmarks.draw import redraw
+    name, *words = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    known = benchmarks()
+    if name == "draw":
+        set_up(one_core=False)
+        import_module("benchmarks.draw").redraw(words)
+    elif name == "all":
+        commands = ([sys.executable, "-m", "benchmarks", each, *words] for each in known)
+        failed = [
+            command[3] for command in commands if subprocess.run(command, cwd=ROOT).returncode
+        ]
+        raise SystemExit(f"failed: {', '.join(failed)}" if failed else 0)
+    elif name in known:
+        run(name, words)
+    else:
+        print(__doc__, *(f"{each}: {about}" for each, about in known.items()), sep="\n")
+        raise SystemExit(0 if name in ("-h", "--help") else 2)
 
-        redraw(chosen.pictures, chosen.output)
-        return
-    benchmark = next((known for known in BENCHMARKS if known.name == chosen.name), None)
-    set_up(benchmark is not None and benchmark.one_core)
+
+def benchmarks() -> dict[str, str]:
+    """The first paragraph of the docstring of each benchmark, by name; read from the source, since
+    importing one starts JAX.
+    """
+    found = {}
+    for file in sorted(FOLDER.glob("*.py")):
+        module = ast.parse(file.read_text(encoding="utf-8"))
+        functions = [x.name for x in module.body if isinstance(x, ast.FunctionDef)]
+        if file.stem != "__main__" and "run" in functions:
+            paragraph, *_ = (ast.get_docstring(module) or "").split("\n\n")
+            found[file.stem] = " ".join(paragraph.split())
+    return found
+
+
+def run(name: str, words: Sequence[str]) -> None:
+    """Run a benchmark with the options of its command."""
+    one_core = "\nONE_CORE = True\n" in (FOLDER / f"{name}.py").read_text(encoding="utf-8")
+    set_up(one_core)
+    module = import_module(f"benchmarks.{name}")
+    chosen = vars(parser_of(name, module).parse_args(words))
     from benchmarks.output import RESULTS, Output, refusal
 
-    if chosen.replace:
-        if why := refusal(chosen.quick):
-            print(f"{chosen.name}: {why}", file=sys.stderr)
-            raise SystemExit(2)
-        chosen.output = RESULTS
-    if benchmark is None:
-        raise SystemExit(run_all(chosen))
-    options = {
-        name: value
-        for name, value in vars(chosen).items()
-        if name not in SHARED and value is not None
-    }
-    import_module(benchmark.module_name).run(Output(chosen.output, chosen.quick), **options)
+    quick, folder, replace = (chosen.pop(x) for x in ("quick", "output", "replace"))
+    if replace and (why := refusal(quick)):
+        raise SystemExit(f"{name}: {why}")
+    given = {option: value for option, value in chosen.items() if value is not None}
+    module.run(Output(RESULTS if replace else folder, quick), **given)
 
 
-def run_all(chosen: argparse.Namespace) -> int:
-    """Run every benchmark in a process of its own; 1 if one of them fails.
-
-    What is done is noted beside the results with the commit, so that a second call goes on where
-    the first one ended.
+def set_up(one_core: bool) -> None:
+    """Double precision, and where it is asked for one core, for this process and all that it
+    starts.
     """
-    from benchmarks.output import hardware
-
-    state = f"{'quick ' if chosen.quick else ''}{hardware()['commit']}"
-    output = chosen.output.resolve()
-    output.mkdir(parents=True, exist_ok=True)
-    ledger = output / ".all"
-    done = set(ledger.read_text().splitlines()) if ledger.exists() else set()
-    flags = [f"--{name}" for name in ("quick", "replace") if getattr(chosen, name)]
-    failed = 0
-    for benchmark in BENCHMARKS:
-        note = f"{state} {benchmark.name}"
-        if note in done:
-            continue
-        print(f"{benchmark.name}: {benchmark.question}", flush=True)
-        start = time.perf_counter()
-        command = [
-            sys.executable,
-            "-m",
-            "benchmarks",
-            benchmark.name,
-            "--output",
-            str(output),
-            *flags,
-        ]
-        code = subprocess.run(command, cwd=ROOT).returncode
-        print(
-            f"{benchmark.name}: status {code}, {(time.perf_counter() - start) / 60:.1f} minutes",
-            flush=True,
-        )
-        failed |= code != 0
-        if not (code or state.endswith("-dirty")):
-            with ledger.open("a") as file:
-                file.write(f"{note}\n")
-    return int(failed)
+    if "jax" in sys.modules:
+        raise RuntimeError("JAX has been imported before it was set up.")
+    os.environ["JAX_ENABLE_X64"] = "1"
+    if one_core:
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {ONE_CORE}".strip()
+        os.environ["OMP_NUM_THREADS"] = "1"
 
 
-def listing(benchmark: Benchmark) -> str:
-    """Name, minutes, question and results of a benchmark, as lines of text."""
-    full, quick = (f"{minutes:g}" for minutes in benchmark.minutes)
-    results = ", ".join(benchmark.files) or "keeps no result"
-    return (
-        f"{benchmark.name}  {full} min, quick {quick} min\n    {benchmark.question}\n    {results}"
+def parser_of(name: str, module: Any) -> argparse.ArgumentParser:
+    """The options that all benchmarks share, and the further arguments of this one's ``run``."""
+    parser = argparse.ArgumentParser(
+        f"python -m benchmarks {name}",
+        description=module.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-
-
-def parser() -> argparse.ArgumentParser:
-    """The command line: the shared options, and those of each benchmark."""
-    main_parser = argparse.ArgumentParser(
-        "python -m benchmarks", description="Without a name, lists all benchmarks."
-    )
-    names = main_parser.add_subparsers(dest="name", metavar="NAME", title="benchmarks")
-    shared = argparse.ArgumentParser(add_help=False)
-    shared.add_argument(
-        "--quick", action="store_true", help="small and inaccurate, into files named _quick"
-    )
-    shared.add_argument(
-        "--output",
-        type=Path,
-        default=ROOT / "benchmarks" / "scratch",
-        help="folder [default: benchmarks/scratch, which is not committed]",
-    )
-    shared.add_argument(
-        "--replace",
-        action="store_true",
-        help="replace the committed results in benchmarks/results; the tree must have no "
-        "uncommitted changes, so that each result names a commit that exists",
-    )
-    about = "run all of them, one after the other; a second call goes on where the first one ended"
-    names.add_parser("all", parents=[shared], help=about, description=about)
-    about = "draw the figures of the committed results again, without a measurement"
-    draw = names.add_parser("draw", help=about, description=about)
-    draw.add_argument(
-        "pictures", nargs="*", metavar="PICTURE", help="name without .png [default: all]"
-    )
-    draw.add_argument(
-        "--output",
-        type=Path,
-        default=ROOT / "benchmarks" / "results",
-        help="folder [default: benchmarks/results]",
-    )
-    for benchmark in BENCHMARKS:
-        subparser = names.add_parser(
-            benchmark.name,
-            parents=[shared],
-            help=benchmark.question.replace("%", "%%"),
-            description=module_docstring(benchmark),
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        for option in benchmark.options:
-            subparser.add_argument(
-                option.name, type=option.kind, choices=option.choices, help=option.help
-            )
-    return main_parser
-
-
-def module_docstring(benchmark: Benchmark) -> str:
-    """The docstring of the module, read from its source: importing it would start JAX."""
-    source = (ROOT / benchmark.module_name.replace(".", "/")).with_suffix(".py")
-    return ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""
+    quick = "small and inaccurate, into files named _quick"
+    replace = "replace the committed results in benchmarks/results, from a clean working tree"
+    parser.add_argument("--quick", action="store_true", help=quick)
+    parser.add_argument("--output", type=Path, default=FOLDER / "scratch", help="folder")
+    parser.add_argument("--replace", action="store_true", help=replace)
+    kinds = get_type_hints(module.run)
+    for option in list(inspect.signature(module.run).parameters)[1:]:
+        kind, *_ = get_args(kinds[option]) or (kinds[option],)
+        flag = f"--{option.replace('_', '-')}"
+        if kind is bool:
+            parser.add_argument(flag, action="store_true")
+        elif isinstance(kind, str):  # one of the words of a Literal
+            parser.add_argument(flag, choices=get_args(kinds[option]))
+        else:
+            parser.add_argument(flag, type=kind)
+    return parser
 
 
 if __name__ == "__main__":

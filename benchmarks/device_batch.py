@@ -15,6 +15,7 @@ numba engine, whose calls must repeat to the bit.
 import time
 from functools import partial
 from itertools import product
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,7 @@ DISTINCT, APART = 16, 0.5  # states of a batch, and the strain between them
 TURNS, ENOUGH_SECONDS = 3, 60
 
 
-def run(output: Output, engine: str = "auto") -> None:
+def run(output: Output, engine: Literal["auto", "numba"] = "auto") -> None:
     """Compare every batch at every point, print, and write JSON after each."""
     numerics = Numerics(engine=engine_named(engine))
     batches, points = BATCHES + (() if on_processor() else ACCELERATOR_BATCHES), POINTS

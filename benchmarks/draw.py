@@ -4,7 +4,6 @@ The picture of a single flow (``flow``) keeps no result, so its benchmark draws 
 """
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -46,9 +45,9 @@ PICTURES: dict[str, Callable[[], Figure]] = {
 }
 
 
-def redraw(names: Sequence[str], folder: Path) -> None:
+def redraw(names: Sequence[str]) -> None:
     """Write the pictures of these names, or all."""
-    output = Output(folder, quick=False, hardware={})
+    output = Output(RESULTS, quick=False, hardware={})
     for name in names or PICTURES:
         output.write_picture(PICTURES[name](), name)
         print(output.path(name, ".png"), flush=True)

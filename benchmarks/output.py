@@ -13,7 +13,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from benchmarks.process import ROOT
+from benchmarks import ROOT
 from jaxgran import environment
 from jaxgran.plotting.style import FILE_DPI, write
 

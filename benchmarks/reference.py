@@ -53,6 +53,8 @@ from jaxgran.theory.corrected_shear import corrected_shear
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.navier_stokes import garzo_dufty
 
+ONE_CORE = True
+
 THEORIES: dict[str, Callable] = {f.__name__: f for f in (gaussian_moments, garzo_dufty)}
 TERMS = 20  # of the Chebyshev series along each coordinate
 MARGIN = 0.01  # by which the series reaches beyond the map, as a share of its range

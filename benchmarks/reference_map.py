@@ -24,7 +24,7 @@ force ratio.
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -184,10 +184,11 @@ SEVERAL_SEEDS = {
     "dissipative": dissipative,
 }
 PARTS = {"sizes": sizes, "check": check, "coarse": coarse}
+Part = Literal["plane", "between", "dense", "dissipative", "sizes", "check", "coarse"]
 
 
 def run(
-    output: Output, seeds: int = 2, first_seed: int = 0, part: str = "plane", folder: Path = KEPT
+    output: Output, seeds: int = 2, first_seed: int = 0, part: Part = "plane", folder: Path = KEPT
 ) -> None:
     """Map what is missing of a part, and write it; all seeds of ``PLANE`` as one map."""
     if part not in SEVERAL_SEEDS and (seeds, first_seed) != (2, 0):

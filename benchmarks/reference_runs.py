@@ -14,6 +14,7 @@ import multiprocessing
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -39,7 +40,7 @@ LARGE = {"grains": 102_400, "timestep": 3e-4, "equilibrate": 250.0, "strain": 40
 QUICK_LARGE = {"grains": 400, "timestep": 1e-3, "equilibrate": 1.0, "strain": 8.0}
 
 
-def run(output: Output, part: str = "random") -> None:
+def run(output: Output, part: Literal["random", "large"] = "random") -> None:
     """Run the flows of a part, print each, and write them as JSON as they end."""
     start = time.perf_counter()
     name, full, quick, rows_of = PARTS[part]

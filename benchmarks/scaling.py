@@ -23,8 +23,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran as jg
+from benchmarks import ROOT
 from benchmarks.output import Output
-from benchmarks.process import ROOT
 from jaxgran.plotting.style import TWO_COLUMNS, styled
 
 GRAINS, QUICK_GRAINS = (128, 512, 2_000, 10_000, 30_000, 100_000, 1_000_000), (1_000, 10_000)

@@ -26,8 +26,8 @@ import jax
 import numpy as np
 
 import jaxgran as jg
+from benchmarks import ROOT
 from benchmarks.output import Output, rounded
-from benchmarks.process import ROOT
 from benchmarks.size_figures import draw_sizes, draw_waves
 from jaxgran.dynamics.tally import TABLE, Tally
 from jaxgran.dynamics.velocity_scales import BOX_GRAINS, WAVES, boxes_across

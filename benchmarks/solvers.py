@@ -22,6 +22,8 @@ from benchmarks.timing import timed
 from jaxgran.contact.solve_contacts import ContactSolution
 from jaxgran.model.status import Status
 
+ONE_CORE = True
+
 RESTITUTIONS, PACKING_FRACTIONS = (0.9, 0.5, 0.1), (0.7, 0.8, 0.82)
 GRAINS, TIMESTEP = 256, 1e-3
 STRAIN, INSTANTS, CHOSEN = 2.0, 20, 2

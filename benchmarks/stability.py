@@ -47,6 +47,8 @@ from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, empty_figure, styled
 from jaxgran.sampling.averages import averages as averages_of_sums
 from jaxgran.sampling.timestep import deepest_overlap
 
+ONE_CORE = True
+
 RIGHT = 0.05  # relative error of an average
 PRECISION = 0.01  # relative standard error, that of the reference included
 REFERENCE_PRECISION = 0.006  # that of the reference alone

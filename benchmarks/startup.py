@@ -15,38 +15,21 @@ import tempfile
 import time
 from pathlib import Path
 
+from benchmarks import ROOT
 from benchmarks.output import Output
-from benchmarks.process import ROOT
 
 RUNS = 5
 MAP = "map.nc"
 COMMANDS = {
-    "help": ["--help"],
-    "info": ["info"],
-    "run, strain 0.5": [
-        "run",
-        "--restitution",
-        "0.5",
-        "--packing-fraction",
-        "0.7",
-        "--strain",
-        "0.5",
-        "--quiet",
-    ],
-    "map, quick preset": ["map", "--output", MAP, "--quiet"],
-    "plot": ["plot", MAP],
+    "help": "--help",
+    "info": "info",
+    "run, strain 0.5": "run --restitution 0.5 --packing-fraction 0.7 --strain 0.5 --quiet",
+    "map, quick preset": f"map --output {MAP} --quiet",
+    "plot": f"plot {MAP}",
 }
-SMALL_MAP = [
-    "map",
-    "--restitution",
-    "0.3,0.7",
-    "--packing-fraction",
-    "0.5,0.6",
-    "--grains",
-    "32",
-    "--output",
-    MAP,
-]
+SMALL_MAP = (
+    f"map --restitution 0.3,0.7 --packing-fraction 0.5,0.6 --grains 32 --output {MAP} --quiet"
+)
 _SAMPLE = """
 import time, statistics, jax
 jax.config.update("jax_enable_x64", True)
@@ -73,9 +56,8 @@ def run(output: Output) -> None:
     rows = []
     with tempfile.TemporaryDirectory(prefix="jaxgran-startup-") as name:
         folder = Path(name)
-        for command, words in COMMANDS.items():
-            if output.quick and words[0] == "map":
-                words = [*SMALL_MAP, "--quiet"]
+        for command, text in COMMANDS.items():
+            words = (SMALL_MAP if output.quick and text.startswith("map") else text).split()
             first = seconds_of(words, folder)
             warm = [seconds_of(words, folder) for _ in range(2 if output.quick else RUNS)]
             rows.append(

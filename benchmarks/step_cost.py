@@ -20,6 +20,8 @@ import jaxgran as jg
 from benchmarks.independent import contact_dynamics
 from benchmarks.output import Output
 
+ONE_CORE = True
+
 RESTITUTIONS, PACKING_FRACTIONS = (0.9, 0.5, 0.1), (0.56, 0.7, 0.8)
 STRAINS = {1e-3: 2.0, 1e-4: 1.0, 1e-5: 0.5}  # advanced at a time
 GRAINS, TOLERANCE = 256, 1e-4

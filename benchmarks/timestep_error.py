@@ -24,6 +24,8 @@ from jaxgran.environment import usable_cores
 from jaxgran.sampling.sample import estimates
 from jaxgran.sampling.timestep import deepest_overlap, stress_error
 
+ONE_CORE = True
+
 RELAXATION = 2.0  # strain at a new time step before its sample
 ALLOWED = 0.03  # relative error of the pressure that has to be foretold
 

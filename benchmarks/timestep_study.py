@@ -36,6 +36,8 @@ from jaxgran.environment import usable_cores
 from jaxgran.plotting.style import RATIO_LABEL, TWO_COLUMNS, styled
 from jaxgran.sampling.sample import estimates
 
+ONE_CORE = True
+
 RULES = ("midpoint", "touching")
 START = 1e-3  # time step of the steady state
 RELAXATION = 0.5

@@ -1,5 +1,5 @@
-"""All benchmarks are run by one command, their results are named once, and what the charts judge by
-is right.
+"""All benchmarks are run by one command, their results are used, and what the charts judge by is
+right.
 """
 
 import inspect
@@ -7,16 +7,17 @@ import subprocess
 from importlib import import_module
 from itertools import product
 from pathlib import Path
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
 from matplotlib.text import Text
 
 from benchmarks import output
+from benchmarks.__main__ import benchmarks, parser_of
 from benchmarks.draw import PICTURES
 from benchmarks.peers import front
 from benchmarks.reference_map import BETWEEN, DENSER, PLANE, reference_points
-from benchmarks.registry import BENCHMARKS
 from benchmarks.timestep_study import arrays
 from jaxgran.maps.results import open_map
 
@@ -33,21 +34,20 @@ def committed() -> list[str]:
     return listed.stdout.split()
 
 
-def test_every_result_is_named_by_one_benchmark_and_every_name_is_there() -> None:
-    named = [file for one in BENCHMARKS for file in one.files]
-    assert sorted(named) == sorted(committed())
-    assert all((output.RESULTS / file).is_file() for file in named)
+def test_every_result_is_named_by_a_page_or_a_program() -> None:
+    sources = [*(ROOT / "docs" / "_build").rglob("*.md"), *ROOT.glob("*/*.py")]
+    text = "".join(path.read_text(encoding="utf-8") for path in sources)
+    assert not [name for name in committed() if name not in text and Path(name).stem not in text]
 
 
-@pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda benchmark: benchmark.name)
-def test_run_takes_the_options_of_the_registry(benchmark) -> None:
-    module = import_module(benchmark.module_name)
-    options = [option.name.lstrip("-").replace("-", "_") for option in benchmark.options]
-    first, *others = inspect.signature(module.run).parameters.values()
-    assert first.name == "output"
-    assert [parameter.name for parameter in others] == options
-    assert all(parameter.default is not parameter.empty for parameter in others)
-    assert f"python -m benchmarks {benchmark.name}" in module.__doc__
+@pytest.mark.parametrize("name", benchmarks())
+def test_a_benchmark_says_its_command_and_its_options_can_be_given(name: str) -> None:
+    module = import_module(f"benchmarks.{name}")
+    assert f"python -m benchmarks {name}" in module.__doc__
+    _, *parameters = inspect.signature(module.run).parameters.values()
+    shared = {"quick": True, "output": ANY, "replace": False}
+    given = vars(parser_of(name, module).parse_args(["--quick"]))
+    assert given == {x.name: x.default if x.default is False else None for x in parameters} | shared
 
 
 @pytest.mark.parametrize("name", PICTURES)

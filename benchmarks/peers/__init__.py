@@ -1,5 +1,5 @@
 """Peers: other programs that simulate the same sheared discs, one module each, compared by
-``compare``.
+``speed_vs_accuracy``.
 
 A module of a peer offers:
 

@@ -33,6 +33,8 @@ from benchmarks.peers.front import OBSERVABLES, TARGET, table
 from benchmarks.peers.problem import Discs, Flow, averages, relative
 from benchmarks.peers.workers import Worker
 
+ONE_CORE = True
+
 PEERS = (jaxgran_itself, numba_rival, lammps, event_driven)
 REFERENCE_TIMESTEP, FORCE_TIMESTEP = 3e-5, 1e-5
 FORCE_ROUNDS = 5  # times fewer rounds suffice for the force ratio
