@@ -31,6 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if name == "draw":
         set_up(one_core=False)
         import_module("benchmarks.draw").redraw(words)
+    elif name == "all" and "--replace" in words:
+        raise SystemExit("all: replace results one by one, as some are made from others.")
     elif name == "all":
         commands = ([sys.executable, "-m", "benchmarks", each, *words] for each in known)
         failed = [

@@ -2,7 +2,7 @@
 
 From the reference map: the dissipation rate Γ over Enskog's Γ_E at the measured temperature tensor,
 scaled to the local temperature; and the lengths L = Γ_E/Γ and L′ = (Γ_E/p_E)/(Γ/p) with contact
-pressures. Laws of L′ and of L/L′ = p/p_E, which ``corrected_shear`` takes, are fitted to all flows,
+pressures. Laws of L′ and of L′/L = p/p_E, which ``corrected_shear`` takes, are fitted to all flows,
 with each restitution and packing fraction left out in turn, and laws of L up to ν = 0.75. They are
 judged on 30 other flows (N = 1600, dt = 3e-4), as is the corrected theory.
 

@@ -47,6 +47,8 @@ PICTURES: dict[str, Callable[[], Figure]] = {
 
 def redraw(names: Sequence[str]) -> None:
     """Write the pictures of these names, or all."""
+    if unknown := [name for name in names if name not in PICTURES]:
+        raise SystemExit(f"draw: there is no {unknown[0]}; there are {', '.join(PICTURES)}.")
     output = Output(RESULTS, quick=False, hardware={})
     for name in names or PICTURES:
         output.write_picture(PICTURES[name](), name)

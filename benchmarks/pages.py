@@ -215,6 +215,7 @@ ENVIRONMENT.filters |= {
     "date": lambda number: f"{number // 10000}-{number // 100 % 100:02d}-{number % 100:02d}",
 }
 ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table}
+ENVIRONMENT.globals |= {"cheapest_ratio": front.cheapest_ratio}
 ENVIRONMENT.globals |= {"ASSUMPTIONS": ASSUMPTIONS, "timestep_verdicts": timestep_error.verdicts}
 ENVIRONMENT.globals |= {"SIZE_LAWS": SIZE_LAWS}
 ENVIRONMENT.globals |= {

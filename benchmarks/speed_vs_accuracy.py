@@ -1,7 +1,7 @@
 """Speed against accuracy: what a unit of strain costs, and how wrong pressure and shear stress are.
 
 jaxgran, a loop of the classical Gauss–Seidel scheme, soft discs in LAMMPS and an event-driven
-program (see the modules beside this one) shear the same discs from the same steady state. Each
+program (the modules in ``peers``) shear the same discs from the same steady state. Each
 trades time for accuracy by one setting: contact dynamics by its time step, soft discs by their
 stiffness, whose time step is a fixed share of a contact. Event-driven discs have none; where they
 collapse the row says so; with a duration of contact they do not, and are an independent answer
@@ -11,8 +11,8 @@ own process. Times are medians of the processor time over the rounds. What a fir
 with jaxgran, at a time step of 3e-5 and a tolerance of 1e-6 over a longer strain; of the force
 ratio, which depends on the time step in dense flows, at 1e-5.
 
-``front.py`` compares equal work: the cheapest settings within 3 %, at overlaps no deeper than those
-of the other program. ``chart.py`` draws the figure.
+``peers/front.py`` compares equal work: the cheapest settings within 3 %, at overlaps no deeper than
+those of the other program. ``peers/chart.py`` draws the figure.
 
     python -m benchmarks speed_vs_accuracy           # about an hour
     python -m benchmarks speed_vs_accuracy --quick   # one flow of 256 discs, under 3 minutes

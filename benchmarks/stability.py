@@ -144,7 +144,6 @@ def run(output: Output, folder: Path | None = None) -> None:
         }
         results = [done[case].result() for case in plan.cases]
     head = {
-        "planned": len(plan.cases),
         "seeds": plan.seeds,
         "right": RIGHT,
         "precision": PRECISION,
@@ -477,6 +476,7 @@ def cell_of(row: dict, names: Sequence[str]) -> tuple[str, str]:
         return LETTERS["runs"][0], WRONG_WARNED if warned else UNKNOWN
     error, noise = max(errors, key=lambda pair: abs(pair[0]))
     text = f"{100 * error:+.0f}" if abs(error) >= 0.0995 else f"{100 * error:+.1f}"
+    text = text.replace("-", "−")
     if not noise <= PRECISION:
         text += f"\n±{100 * noise:.2g}"
         if not abs(abs(error) - RIGHT) >= 2 * noise:
@@ -535,7 +535,7 @@ def draw(rows: list[dict]) -> Figure:
         loc="outside lower center",
         ncols=3,
         fontsize=SMALL_SIZE,
-        title=f"error in %, standard error above 1 %, largest overlap in σ; {known}",
+        title=f"error in %, standard error above 1 %, largest overlap in σ (jaxgran); {known}",
         title_fontsize=SMALL_SIZE,
     )
     return figure
@@ -549,6 +549,7 @@ def name_of(case: Case) -> str:
 
 def title(method: str, setting: float) -> str:
     """A method with its setting, or the setting alone."""
+    method = "jaxgran" if method == DEFAULT else method
     if setting == 0:
         return method
     mantissa, exponent = f"{setting:.0e}".split("e")

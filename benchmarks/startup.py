@@ -4,7 +4,7 @@ Every command runs in its own process, with a cache folder of this benchmark: on
 it, and then five times more, of which the median is taken.
 
     python -m benchmarks startup            # 3 minutes on two cores
-    python -m benchmarks startup --quick    # two runs of each command, and no map
+    python -m benchmarks startup --quick    # two runs of each command, and a small map
 """
 
 import os

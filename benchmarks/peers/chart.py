@@ -41,7 +41,7 @@ LOOKS = {
     "projected Jacobi": Look("projected Jacobi", "tab:purple", "v"),
     "numba loop": Look("Gauss–Seidel loop", "0.55", "s", "--"),
     "LAMMPS": Look("soft discs, LAMMPS", "#b35806", "D"),
-    "event-driven": Look("event-driven", "tab:blue", "*", ""),
+    "event-driven": Look("event-driven, hard discs", "tab:blue", "*", ""),
     "TC model": Look("event-driven, TC model", "tab:blue", "P"),
 }
 
@@ -51,7 +51,7 @@ def draw(result: dict) -> Figure:
     """|error| of pressure and force ratio against processor time.
 
     Args:
-      result: that of ``compare``.
+      result: that of ``speed_vs_accuracy``.
     """
     flows = result["flows"]
     figure = empty_figure(TWO_COLUMNS, 4.6)
@@ -70,12 +70,12 @@ def draw(result: dict) -> Figure:
                     handles[curve] = drawn
             label_log_axis(axes.xaxis)
         failed = [
-            f"{LOOKS[curve].label} {failure_of(curve)}"
+            f"{LOOKS[curve].label}: {failure_of(curve)}"
             for curve in LOOKS
             if not rows_of(flow, curve) and any(row["curve"] == curve for row in flow["rows"])
         ]
-        place = {"transform": panels[0, column].transAxes, "fontsize": SMALL_SIZE, "va": "bottom"}
-        panels[0, column].text(0.04, 0.03, "\n".join(failed), **place)
+        place = {"transform": panels[0, column].transAxes, "fontsize": SMALL_SIZE}
+        panels[0, column].text(0.97, 0.96, "\n".join(failed), ha="right", va="top", **place)
     for axes, words in zip(panels[:, 0], OBSERVABLES.values(), strict=True):
         axes.set_ylabel(f"|error of the {words}|")
         axes.yaxis.set_major_locator(FixedLocator([0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1]))

@@ -98,9 +98,10 @@ def deepest_overlap(packing_fraction: ArrayLike, grains: ArrayLike) -> Any:
     small dense system is that of the times when it is nearly jammed.
 
     Of 192 samples of 256 grains, with time steps of 3e-4 to 1e-2, all 34 exceed it whose pressure
-    was off by more than 3 % beyond two standard errors, and 22 that were within 3 %; below it, the
-    pressure at ν ≥ 0.8 was off by 0.3 % on average and 2.3 % at most. The share of contacts deeper
-    than 1e-2 σ misses half of the 34 (``python -m benchmarks timestep_error``).
+    was off by more than 3 % beyond two standard errors, and 22 that were within 3 %; of the
+    six below it at ν ≥ 0.8, the pressure was off by 2.3 % at most. That more than a tenth of the
+    contacts are deeper than 1e-2 σ misses half of the 34 (``python -m benchmarks
+    timestep_error``).
     """
     return _DEEPEST_OVERLAP * mean_gap(packing_fraction + 0.16 * np.asarray(grains) ** -0.55)
 
@@ -108,7 +109,9 @@ def deepest_overlap(packing_fraction: ArrayLike, grains: ArrayLike) -> Any:
 def automatic_timestep(
     temperature: ArrayLike, packing_fraction: ArrayLike, activation: ArrayLike, target_error: float
 ) -> np.ndarray:
-    """Longest time step, in t, with a stress error within the target and no deep overlap."""
+    """Longest time step, in t, with a stress error within the target and no deep overlap of some
+    hundred grains or more.
+    """
     crossing = target_error / stress_error(1.0, packing_fraction)
     accurate = crossing / np.sqrt(np.asarray(temperature))
     return np.minimum(accurate, longest_timestep(temperature, packing_fraction, activation))
