@@ -21,7 +21,7 @@ from typing import Any, get_args, get_type_hints
 from benchmarks import ROOT
 
 FOLDER = ROOT / "benchmarks"
-ONE_CORE = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+ONE_CORE_FLAGS = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -83,7 +83,7 @@ def set_up(one_core: bool) -> None:
         raise RuntimeError("JAX has been imported before it was set up.")
     os.environ["JAX_ENABLE_X64"] = "1"
     if one_core:
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {ONE_CORE}".strip()
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {ONE_CORE_FLAGS}".strip()
         os.environ["OMP_NUM_THREADS"] = "1"
 
 

@@ -54,6 +54,7 @@ PREDICTED = {
     "shear_stress": "shear_stress",
 }
 """What is measured, by its name here, and the field of the corrected theory that predicts it."""
+WITHOUT_LAWS = MEASURED_LAWS._replace(length=np.zeros(3), pairs=np.zeros(3))
 DENSEST = 0.75  # packing fraction up to which laws of L are fitted
 DRAWN = (0.1, 0.3, 0.5, 0.7, 0.9)  # restitutions
 
@@ -70,8 +71,9 @@ def run(output: Output) -> None:
         "paper": flattened(jg.open_map(RESULTS / "paper.nc")),
         "judged_on": flattened(jg.ratio_map(**another, workers=usable_cores())),
     }
-    points, paper, judged = map(flows_of, maps.values())
-    content = {name: head(data, len(flows_of(data))) for name, data in maps.items()} | {
+    flows = {name: flows_of(data) for name, data in maps.items()}
+    points, paper, judged = flows.values()
+    content = {name: head(data, len(flows[name])) for name, data in maps.items()} | {
         "counts": counts(points),
         "counts_of_paper": counts(paper),
         "largest_excess_of_root_chaos": root_chaos(points),
@@ -256,8 +258,10 @@ def corrected_theory(flows: pd.DataFrame, judged: pd.DataFrame) -> dict:
             for x in values
         )
         result[f"rms_{kind}_left_out"] = {name: rms(errors[name]) for name in errors}
-    none = laws._replace(length=np.zeros(3), pairs=np.zeros(3))
-    for name, errors in (("enskog", misfits(none, judged)), ("length_and_pairs", elsewhere)):
+    for name, errors in (
+        ("enskog", misfits(WITHOUT_LAWS, judged)),
+        ("length_and_pairs", elsewhere),
+    ):
         result[name] = {
             average: {
                 "rms": rms(errors[average]),
@@ -282,9 +286,8 @@ def draw(flows: pd.DataFrame, judged: pd.DataFrame, laws: CorrelationLaws) -> Fi
         left.errorbar(some.nu, some.length_from_pressure, some.length_from_pressure_error, **look)
         law = np.asarray(correlation_length(laws, np.full_like(dense, alpha), dense))
         left.plot(dense, law, color=style["color"], linestyle="-", linewidth=1)
-    none = laws._replace(length=np.zeros(3), pairs=np.zeros(3))
     for label, applied, face, shift in (
-        ("Enskog", none, "none", 0.004),
+        ("Enskog", WITHOUT_LAWS, "none", 0.004),
         ("corrected", laws, "0", -0.004),
     ):
         ratio = np.exp(misfits(applied, judged)["pressure"])

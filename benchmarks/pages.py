@@ -178,13 +178,6 @@ def quotients(rows: Iterable[Mapping[str, float]], dividend: str, divisor: str) 
     return [row[dividend] / row[divisor] for row in rows]
 
 
-def lammps_ratio(flow: Mapping[str, Any]) -> str:
-    """Time of soft discs in LAMMPS over that of jaxgran, for the same error and no deeper
-    overlaps.
-    """
-    return front.ratio(flow, "LAMMPS")
-
-
 def output_of_where(restitution: float, packing_fraction: float) -> str:
     """What ``jaxgran where`` prints, without empty lines in its table."""
     command = f"where --restitution {restitution} --packing-fraction {packing_fraction}"
@@ -214,16 +207,20 @@ ENVIRONMENT.filters |= {
     "g": lambda value: f"{float(value):g}",
     "date": lambda number: f"{number // 10000}-{number // 100 % 100:02d}-{number % 100:02d}",
 }
-ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table}
-ENVIRONMENT.globals |= {"cheapest_ratio": front.cheapest_ratio}
-ENVIRONMENT.globals |= {"ASSUMPTIONS": ASSUMPTIONS, "timestep_verdicts": timestep_error.verdicts}
-ENVIRONMENT.globals |= {"SIZE_LAWS": SIZE_LAWS}
+ENVIRONMENT.globals |= {
+    "results": Results(),
+    "peers_table": front.table,
+    "peer_ratio": front.ratio,
+    "timestep_verdicts": timestep_error.verdicts,
+    "ASSUMPTIONS": ASSUMPTIONS,
+    "SIZE_LAWS": SIZE_LAWS,
+}
 ENVIRONMENT.globals |= {
     function.__name__: function
     for function in (
         *(max, at, fastest_loop, point, quotients, validity),
         *(sig, percent, percent_pm, pm, duration),
-        *(grains_for, shear_stress_ratio_at, lammps_ratio, output_of_where),
+        *(grains_for, shear_stress_ratio_at, output_of_where),
     )
 }
 ENVIRONMENT.globals |= {

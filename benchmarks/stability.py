@@ -467,7 +467,8 @@ def cell_of(row: dict, names: Sequence[str]) -> tuple[str, str]:
     ``PRECISION``, or the letter of a failure.
     """
     if row["failure"] is not None and row["failure"] != "too_slow":
-        return LETTERS[row["method"] if row["method"] in LETTERS else row["failure"]][0], FAILED
+        word = row["method"] if row["method"] in LETTERS else row["failure"]
+        return LETTERS.get(word, (word,))[0], FAILED
     errors = [row[name] for name in names if row.get(name)]
     warned = status_of(row) == "deep_overlap"
     if not errors:

@@ -110,6 +110,10 @@ def test_forward_derivatives_follow_replicas(name: str, states) -> None:
     run = compiled(slope)
     alone = np.array([run(alpha, replica(states, k)) for k, alpha in enumerate(ALPHAS)])
     np.testing.assert_array_equal(compiled(jax.vmap(slope))(ALPHAS, states), alone)
+    by_vmap = compiled(
+        lambda x: jax.jvp(lambda y: jax.vmap(speed)(y, states), (x,), (jnp.ones_like(x),))[1]
+    )
+    np.testing.assert_allclose(by_vmap(ALPHAS), alone, rtol=1e-12)
     columns = compiled(jax.jacfwd(lambda x: jax.vmap(speed)(x, states)))(ALPHAS)
     np.testing.assert_allclose(columns, np.diag(alone), rtol=1e-12)
     energy, step = compiled(partial(speed, state=replica(states, 0))), 1e-6

@@ -46,7 +46,9 @@ def test_every_result_is_named_by_a_page_or_a_program() -> None:
 def test_a_benchmark_says_its_command_and_its_options_can_be_given(name: str) -> None:
     module = import_module(f"benchmarks.{name}")
     assert f"python -m benchmarks {name}" in module.__doc__
-    _, *parameters = inspect.signature(module.run).parameters.values()
+    first, *parameters = inspect.signature(module.run).parameters.values()
+    assert first.name == "output"
+    assert all(parameter.default is not parameter.empty for parameter in parameters)
     shared = {"quick": True, "output": ANY, "replace": False}
     given = vars(parser_of(name, module).parse_args(["--quick"]))
     assert given == {x.name: x.default if x.default is False else None for x in parameters} | shared

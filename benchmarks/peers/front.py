@@ -67,14 +67,6 @@ def ratio(flow: dict, curve: str) -> str:
     return first if first == last else f"{first}–{last}"
 
 
-def cheapest_ratio(flow: dict, curve: str) -> str:
-    """Time of the cheapest setting of another program within the target over that of jaxgran."""
-    theirs, ours = (cheapest(rows_of(flow, name)) for name in (curve, "jaxgran"))
-    if theirs is None or ours is None or not (theirs.reached and ours.reached):
-        return "–"
-    return _two_digits(theirs.row[COST] / ours.row[COST])
-
-
 def ratio_at_equal_timesteps(flow: dict, curve: str) -> str:
     """Time of a program with a time step over that of jaxgran at the same ones, their geometric
     mean.

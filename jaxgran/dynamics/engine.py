@@ -15,7 +15,6 @@ from typing import Any, ClassVar
 import jax
 from jaxtyping import Array, Int
 
-from jaxgran import environment
 from jaxgran.contact.projected_methods import (
     DEFAULT_SOLVER,
     BarzilaiBorwein,
@@ -29,7 +28,7 @@ from jaxgran.dynamics.numba_engine.observed import advance_by_numba
 from jaxgran.dynamics.numba_engine.team.handler import MOST_GRAINS, has_cuda
 from jaxgran.dynamics.observer import Observe, uses_traced_values
 from jaxgran.dynamics.tally import Tally
-from jaxgran.environment import on_processor, precision
+from jaxgran.environment import default_device, on_processor, precision
 from jaxgran.model.checks import InputError, refused, require_flag, require_whole
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.flow import ShearFlow
@@ -132,9 +131,8 @@ class Numba:
 
     def refuses(self, dtype: str, solver: ProjectedMethod) -> str:
         """What this engine cannot do of what is asked for, in words; "" if it can do all."""
-        platform = environment.default_device().platform
         wrong = {
-            f"on the device {platform}": platform != "cpu" and not has_cuda(),
+            f"on the device {default_device().platform}": not (on_processor() or has_cuda()),
             f"in {dtype} ({_ENABLE_X64} computes in float64)": dtype != "float64",
             f"with the solver {solver_name(solver)}": type(solver) is not BarzilaiBorwein,
         }
