@@ -256,11 +256,11 @@ def test_errors_of_a_point_are_those_of_its_own_flow(settings, data) -> None:
         flow = alpha, nu, *settings.grains, *settings.timestep
         estimates = large_system(numbers, errors, *flow, settings.solver.tolerance)
         for name, estimate in estimates.items():
-            value, *half_widths = estimate
             path = f"{name}_large_system"
-            assert float(point[path]) == pytest.approx(float(value), nan_ok=True)
-            stored = point[f"{path}_ci95"].sel(error_source=list(estimate._fields[1:]))
-            np.testing.assert_allclose(stored, half_widths, rtol=1e-6)
+            assert float(point[path]) == pytest.approx(float(estimate.value), nan_ok=True)
+            for source, half_width in {"total": estimate.total, **estimate.sources}.items():
+                stored = point[f"{path}_ci95"].sel(error_source=source)
+                np.testing.assert_allclose(stored, half_width, rtol=1e-6)
             assert f"{path}_ci95" in data[path].attrs["ancillary_variables"].split()
 
 

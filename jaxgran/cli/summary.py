@@ -31,7 +31,6 @@ _LARGE = {
     "local_granular_temperature": "local T",
     "macroscopic_friction": "friction τ/p",
 }
-_SOURCES = {"sampling": "sampling", "timestep": "dt", "size": "size"}  # of errors above 0.4 %
 _SMALLER = (
     "Smaller errors: of sampling by --strain or --seeds, of dt by --timestep, of the size by "
     "--grains, of all by --error."
@@ -44,7 +43,6 @@ def summary_of(data: Any) -> dict[str, Entry]:
     restitution.
     """
     from jaxgran.maps.schema import (
-        ERROR_SOURCES,
         flag_names,
         flattened,
         path_of,
@@ -82,15 +80,16 @@ def summary_of(data: Any) -> dict[str, Entry]:
             with np.errstate(divide="ignore", invalid="ignore"):
                 known[name] = known[name]._replace(effective_samples=strain / independent)
         if f"{name}_large_system" in flat:
-            half = flat[f"{name}_large_system_ci95"]
-            by_source = {x: half.sel(error_source=x).values for x in ERROR_SOURCES}
-            value, meaning = (
+            halves = flat[f"{name}_large_system_ci95"]
+            sources = halves.error_source.values.tolist()
+            by_source = {x: halves.sel(error_source=x).values for x in sources}
+            known[f"{name}_large_system"] = Entry(
                 flat[f"{name}_large_system"].values,
                 f"{row.meaning}, of a large system",
+                row.unit,
+                ci95=by_source.pop("total"),
+                ci95_by_source=by_source,
             )
-            total = by_source.pop("total")
-            entry = Entry(value, meaning, row.unit, ci95=total, ci95_by_source=by_source)
-            known[f"{name}_large_system"] = entry
         if f"theory/{name}" in flat:
             words = f"{row.meaning}, by kinetic theory"
             known[f"theory/{name}"] = Entry(flat[f"theory/{name}"].values, words, row.unit)
@@ -237,7 +236,9 @@ def _print_large_systems(data: Any, summaries: Iterable[Summary]) -> None:
 
 def _print_large_system(summary: Summary, polydispersity: float | None) -> None:
     from jaxgran.maps.variables import MEASURED_FLOWS
+    from jaxgran.sampling.budget import ERROR_SOURCES
 
+    headings = {source: words for source, words in ERROR_SOURCES.items() if words is not None}
     is_point = np.size(summary["status"].value) == 1
     if is_point:
         size = f"extrapolated from N = {np.ravel(summary['grains'].value)[0]}"
@@ -253,7 +254,7 @@ def _print_large_system(summary: Summary, polydispersity: float | None) -> None:
     for name, words in _LARGE.items():
         large = summary[f"{name}_large_system"]
         with np.errstate(invalid="ignore", divide="ignore"):
-            sources = {x: _percent(large.ci95_by_source[x] / abs(large.value)) for x in _SOURCES}
+            sources = {x: _percent(large.ci95_by_source[x] / abs(large.value)) for x in headings}
         sources |= {"timestep": ("–", "–")} if name == "force_ratio" else {}
         medians, largest = zip(*sources.values(), strict=True)
         if is_point:
@@ -267,7 +268,7 @@ def _print_large_system(summary: Summary, polydispersity: float | None) -> None:
         rows += [[words, *(x[0] for x in both), *medians]]
         rows += [["  largest", *(x[1] for x in both), *largest]]
     values = ("large system", "kinetic theory") if is_point else ("correction", "total")
-    print_table(title, ("average", *values, *_SOURCES.values()), rows)
+    print_table(title, ("average", *values, *headings.values()), rows)
 
 
 def _predicted(summary: Summary) -> dict[str, str]:

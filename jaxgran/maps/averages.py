@@ -84,7 +84,9 @@ def columns(
     known["status"] = np.maximum.reduce([of_seeds, *of_points]).astype(np.int8)
     for name, estimate in large.items():
         known[f"{name}_large_system"] = estimate.value
-        known[f"{name}_large_system_ci95"] = np.stack(estimate[1:], axis=-1)
+        known[f"{name}_large_system_ci95"] = np.stack(
+            [estimate.total, *estimate.sources.values()], axis=-1
+        )
     return known | _predicted(settings)
 
 

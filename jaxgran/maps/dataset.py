@@ -19,7 +19,7 @@ from jaxgran.maps.own_observables import sums_by_name
 from jaxgran.maps.provenance import made_with
 from jaxgran.maps.replica import Replica, ReplicaId
 from jaxgran.maps.rows import SUMS, sums_of
-from jaxgran.maps.schema import ERROR_SOURCES, FORMAT_VERSION
+from jaxgran.maps.schema import FORMAT_VERSION, SOURCES_AND_TOTAL
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.states import state_values
 from jaxgran.maps.variables import COORDINATES, NOT_RUN, SCALARS, VARIABLES, Variable
@@ -151,7 +151,7 @@ def _coordinates(settings: MapSettings) -> dict[str, dict[str, xr.Variable]]:
     root: dict[str, xr.Variable] = {}
     for name in settings.dimensions:
         root |= along(name, settings.axes[name])
-    for name, labels in (("error_source", ERROR_SOURCES), ("axis_a", "xy"), ("axis_b", "xy")):
+    for name, labels in (("error_source", SOURCES_AND_TOTAL), ("axis_a", "xy"), ("axis_b", "xy")):
         root |= along(name, labels)
     for name in settings.axes.keys() - {*settings.dimensions}:
         root[name] = xr.Variable((), settings.axes[name][0], COORDINATES[name])

@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.model.checks import InputError
-from jaxgran.sampling.budget import Estimate
+from jaxgran.sampling.budget import ERROR_SOURCES
 from jaxgran.sampling.observables import OBSERVABLES, TENSOR_AXES
 
 FORMAT_VERSION = 5
@@ -24,8 +24,8 @@ MapData: TypeAlias = xr.DataTree | xr.Dataset
 
 RATIO = ("force_ratio", "force_ratio_stderr")
 
-ERROR_SOURCES = Estimate._fields[1:]
-"""Coordinate of ``NAME_large_system_ci95``."""
+SOURCES_AND_TOTAL = ("total", *ERROR_SOURCES)
+"""Coordinate ``error_source`` of ``NAME_large_system_ci95``."""
 
 FINEST: dict[str, Callable[[list], float]] = {"grains": max, "timestep": min}
 """Optional dimensions of a map, with the functions that pick the value of the smallest errors."""

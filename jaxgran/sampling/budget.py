@@ -89,27 +89,28 @@ LARGE_SYSTEM = ("force_ratio", "macroscopic_friction", *SIZE_LAWS)
 """The averages of which ``large_system`` has estimates."""
 
 
-class Estimate(NamedTuple):
-    """An average of a large system, and the half-widths of its 95 % interval by source, in its
-    unit.
+ERROR_SOURCES: dict[str, str | None] = {
+    "sampling": "sampling",  # 1.96 standard errors
+    "timestep": "dt",  # bound on the error from the time step
+    "size": "size",  # error of the correction for the number of grains
+    "tolerance": None,  # bound on the error from the tolerance of the contact solves
+}
+"""Sources of the error of an average of a large system, and the headings of their columns in
+printed tables; None: too small to be printed."""
 
-    ===========  ===================================================================================
-    source       half-width
-    ===========  ===================================================================================
-    total        of all sources together, √(sampling² + timestep² + size² + tolerance²)
-    sampling     1.96 standard errors
-    timestep     bound on the error from the time step
-    size         error of the correction for the number of grains
-    tolerance    bound on the error from the tolerance of the contact solves
-    ===========  ===================================================================================
+
+class Estimate(NamedTuple):
+    """An average of a large system, and the half-widths of its 95 % interval in its unit, by the
+    names of ``ERROR_SOURCES``.
     """
 
     value: np.ndarray
-    total: np.ndarray
-    sampling: np.ndarray
-    timestep: np.ndarray
-    size: np.ndarray
-    tolerance: np.ndarray
+    sources: Mapping[str, np.ndarray]
+
+    @property
+    def total(self) -> np.ndarray:
+        """Half-width from all sources together: the root of the sum of their squares."""
+        return np.sqrt(sum(part**2 for part in self.sources.values()))
 
 
 def size_error(
@@ -206,12 +207,11 @@ def large_system(
             large = factor * value
             size = size_error(*flow, name) * np.abs(large)
         scale = np.abs(large)
-        parts = {
+        sources = {
             "sampling": HALF_INTERVAL * factor * stderr,
             "timestep": (0.0 if name == "force_ratio" else 1.0) * step * scale,
             "size": size,
             "tolerance": solve * scale,
         }
-        total = np.sqrt(sum(part**2 for part in parts.values()))
-        estimates[name] = Estimate(large, total, **parts)
+        estimates[name] = Estimate(large, sources)
     return estimates
