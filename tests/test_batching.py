@@ -3,14 +3,14 @@ transformed.
 """
 
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flows import GRAINS, assert_same_bits, flow_of, replica, stacked
+from flows import assert_same_bits, flow_of, replica, stacked
 from jax import export, lax
 from jax.sharding import Mesh, PartitionSpec
 from synthetic import refused
@@ -49,19 +49,20 @@ def advanced(engine: jg.Jax | jg.Numba, alpha, state: jg.State) -> tuple:
     return advance(flow, state, jnp.int32(STEPS), engine=engine)
 
 
+@pytest.fixture(scope="module")
+def alone():
+    """``alone(name)(alpha, state)``: one replica by itself, by an engine; compiled once."""
+    return cache(lambda name: compiled(partial(advanced, ENGINES[name])))
+
+
 @pytest.mark.parametrize("name", ENGINES)
-def test_replicas_of_a_vmap_have_the_bits_of_each_alone(name: str, states) -> None:
+def test_replicas_of_a_vmap_have_the_bits_of_each_alone(name: str, states, alone) -> None:
     run = partial(advanced, ENGINES[name])
-    of_one = compiled(run)
     together = compiled(jax.vmap(run))(ALPHAS, states)
     crossed = compiled(jax.vmap(jax.vmap(run, (0, None)), (None, 0)))(ALPHAS, states)
-    mapped = compiled(lambda alphas, states: lax.map(lambda one: run(*one), (alphas, states)))(
-        ALPHAS, states
-    )
-    for k in range(len(ALPHAS)):
-        alone = of_one(ALPHAS[k], replica(states, k))
-        for batch in (together, mapped, replica(crossed, k)):
-            assert_same(replica(batch, k), alone)
+    for k, alpha in enumerate(ALPHAS):
+        for batch in (together, replica(crossed, k)):
+            assert_same(replica(batch, k), alone(name)(alpha, replica(states, k)))
 
 
 def test_replicas_of_a_vmap_advance_one_after_another(states) -> None:
@@ -79,10 +80,9 @@ def test_replicas_of_a_vmap_advance_one_after_another(states) -> None:
 
 
 def test_lockstep_has_the_bits_of_each_replica_alone_and_lowers_for_every_accelerator(
-    states, monkeypatch
+    states, alone, monkeypatch
 ) -> None:
-    alone_of = compiled(partial(advanced, jg.Jax()))
-    alone = [alone_of(alpha, replica(states, k)) for k, alpha in enumerate(ALPHAS)]
+    ends = [alone("jax")(alpha, replica(states, k)) for k, alpha in enumerate(ALPHAS)]
     accelerator = SimpleNamespace(platform="accelerator")
     monkeypatch.setattr(environment, "default_device", lambda: accelerator)
     run = jax.vmap(
@@ -91,7 +91,7 @@ def test_lockstep_has_the_bits_of_each_replica_alone_and_lowers_for_every_accele
         )
     )
     together = compiled(run)(ALPHAS, states)
-    for k, one in enumerate(alone):
+    for k, one in enumerate(ends):
         assert_same(replica(together, k), one)
     crossed = compiled(jax.vmap(run, (None, 0)))(ALPHAS, jax.tree.map(lambda x: x[None], states))
     assert_same_bits(replica(crossed, 0), together)
@@ -99,81 +99,94 @@ def test_lockstep_has_the_bits_of_each_replica_alone_and_lowers_for_every_accele
     assert "custom_call" not in exported.mlir_module()
 
 
-@pytest.mark.parametrize("name", ENGINES)
-def test_forward_derivatives_follow_replicas(name: str, states) -> None:
-    def speed(alpha, state):
-        return jnp.sum(advanced(ENGINES[name], alpha, state)[0].velocities ** 2)
+def speed(name: str, alpha, state) -> jax.Array:
+    return jnp.sum(advanced(ENGINES[name], alpha, state)[0].velocities ** 2)
 
-    def slope(alpha, state):
-        return jax.jvp(lambda x: speed(x, state), (alpha,), (jnp.ones_like(alpha),))[1]
 
-    run = compiled(slope)
-    alone = np.array([run(alpha, replica(states, k)) for k, alpha in enumerate(ALPHAS)])
-    np.testing.assert_array_equal(compiled(jax.vmap(slope))(ALPHAS, states), alone)
-    by_vmap = compiled(
-        lambda x: jax.jvp(lambda y: jax.vmap(speed)(y, states), (x,), (jnp.ones_like(x),))[1]
-    )
-    np.testing.assert_allclose(by_vmap(ALPHAS), alone, rtol=1e-12)
-    columns = compiled(jax.jacfwd(lambda x: jax.vmap(speed)(x, states)))(ALPHAS)
-    np.testing.assert_allclose(columns, np.diag(alone), rtol=1e-12)
-    energy, step = compiled(partial(speed, state=replica(states, 0))), 1e-6
-    numerical = (energy(ALPHAS[0] + step) - energy(ALPHAS[0] - step)) / (2 * step)
-    np.testing.assert_allclose(alone[0], numerical, rtol=1e-4)
+def slope(name: str, alpha, state) -> jax.Array:
+    return jax.jvp(lambda x: speed(name, x, state), (alpha,), (jnp.ones_like(alpha),))[1]
+
+
+@pytest.fixture(scope="module")
+def slopes(states) -> tuple[np.ndarray, int]:
+    """The derivative of each replica alone by the engine ``Jax``, and its number of conditions."""
+    traced = compiled(partial(slope, "jax")).trace(ALPHAS[0], replica(states, 0))
+    run = traced.lower().compile()
+    values = [run(alpha, replica(states, k)) for k, alpha in enumerate(ALPHAS)]
+    return np.array(values), str(traced.jaxpr).count(" cond[")
+
+
+def test_forward_derivatives_are_those_of_finite_differences(states, alone, slopes) -> None:
+    step = 1e-6
+    high, low = (alone("jax")(ALPHAS[0] + x, replica(states, 0))[0] for x in (step, -step))
+    numerical = np.sum(np.square(high.velocities) - np.square(low.velocities)) / (2 * step)
+    np.testing.assert_allclose(slopes[0][0], numerical, rtol=1e-4)
+
+
+@pytest.mark.parametrize("order", ["numba, vmap of jvp", "jax, vmap of jvp", "jax, jacfwd of vmap"])
+def test_forward_derivatives_follow_replicas_with_conditions_of_their_own(
+    order: str, states, slopes
+) -> None:
+    """In every order, no condition becomes a choice of both branches."""
+    name, order = order.split(", ")
+
+    def columns(alphas, states):
+        return jax.jacfwd(lambda x: jax.vmap(partial(speed, name))(x, states))(alphas)
+
+    run = jax.vmap(partial(slope, name)) if order == "vmap of jvp" else columns
+    traced = compiled(run).trace(ALPHAS, states)
+    assert str(traced.jaxpr).count(" cond[") >= slopes[1] > 5
+    values = traced.lower().compile()(ALPHAS, states)
+    if run is columns:
+        np.testing.assert_allclose(values, np.diag(slopes[0]), rtol=1e-12)
+    else:
+        np.testing.assert_array_equal(values, slopes[0])
 
 
 def test_reverse_mode_without_a_number_of_events_is_refused(states) -> None:
-    for each in ENGINES.values():
-        with pytest.raises(ValueError, match="Reverse-mode"):
-            jax.grad(
-                jax.jit(lambda x, each=each: advanced(each, x, replica(states, 0))[1].impulse)
-            )(0.5)
+    with pytest.raises(ValueError, match="Reverse-mode"):
+        jax.jit(jax.grad(lambda x: advanced(jg.Numba(), x, replica(states, 0))[1].impulse))(0.5)
 
 
-def test_reverse_mode_of_a_batch_takes_the_number_of_events(states) -> None:
+def test_reverse_mode_of_a_batch_takes_the_number_of_events(states, slopes) -> None:
+    engine = jg.Jax(events=STEPS + 1)
+
     def loss(alphas):
-        flow = flow_of(0.7)
-        engine = jg.Jax(events=STEPS + 1)
-        ends = jax.vmap(
-            lambda a, s: advance(replace(flow, restitution=a), s, jnp.int32(STEPS), engine=engine)[
-                0
-            ]
-        )(alphas, states)
-        return jnp.sum(ends.velocities**2)
+        return jnp.sum(jax.vmap(partial(advanced, engine))(alphas, states)[0].velocities ** 2)
 
-    def alone(alpha, state):
-        flow = replace(flow_of(0.7), restitution=alpha)
-        return jnp.sum(advance(flow, state, jnp.int32(STEPS), engine=jg.Jax())[0].velocities ** 2)
-
-    slope = compiled(jax.jacfwd(alone))
-    forward = [slope(alpha, replica(states, k)) for k, alpha in enumerate(ALPHAS)]
-    np.testing.assert_allclose(compiled(jax.grad(loss))(ALPHAS), forward, rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.grad(loss))(ALPHAS), slopes[0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ENGINES)
-def test_a_share_of_the_replicas_on_each_device_has_the_same_bits(name: str, states) -> None:
+def test_a_share_of_the_replicas_on_each_device_has_the_same_bits(name: str, states, alone) -> None:
     """Of one device here; ``test_batch`` emulates four. The axis may have any name."""
     run = jax.vmap(partial(advanced, ENGINES[name]))
     mesh, spec = Mesh(np.asarray(jax.devices()), ("replica",)), PartitionSpec("replica")
     sharded = jax.shard_map(run, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-    assert_same_bits(compiled(sharded)(ALPHAS, states), compiled(run)(ALPHAS, states))
+    ends = compiled(sharded)(ALPHAS, states)
+    for k, alpha in enumerate(ALPHAS):
+        assert_same(replica(ends, k), alone(name)(alpha, replica(states, k)))
 
 
-def test_a_sample_and_a_scan_advance_replicas_in_turn(states) -> None:
-    def pressure(alpha, state):
-        return jg.sample(
-            replace(flow_of(0.7), restitution=alpha), state, 0.1, blocks=2, engine=jg.Jax()
-        )[1].pressure
-
+def test_a_scan_advances_replicas_in_turn(states, alone) -> None:
     def later(alpha, state):
         def step(state, _):
             return advanced(jg.Jax(), alpha, state)[0], None
 
         return lax.scan(step, state, length=2)[0]
 
-    for function in (pressure, later):
-        together = compiled(jax.vmap(function))(ALPHAS, states)
-        assert_same_bits(replica(together, 1), compiled(function)(ALPHAS[1], replica(states, 1)))
-    assert states.positions.shape == (3, GRAINS, 2)
+    together = compiled(jax.vmap(later))(ALPHAS, states)
+    between, _ = alone("jax")(ALPHAS[1], replica(states, 1))
+    assert_same_bits(replica(together, 1), alone("jax")(ALPHAS[1], between)[0])
+
+
+def test_a_sample_advances_replicas_in_turn(states) -> None:
+    def pressure(alpha, state):
+        flow = replace(flow_of(0.7), restitution=alpha)
+        return jg.sample(flow, state, 0.1, blocks=2, engine=jg.Jax())[1].pressure
+
+    together = compiled(jax.vmap(pressure))(ALPHAS, states)
+    assert together[1] == compiled(pressure)(ALPHAS[1], replica(states, 1))
 
 
 @pytest.mark.parametrize("name", ENGINES)
@@ -205,25 +218,17 @@ def test_a_condition_of_each_replica_takes_its_own_branch(name: str, states) -> 
 
 def test_second_derivatives_are_those_of_the_first_ones(states) -> None:
     def energy(alpha, engine):
-        flow = replace(flow_of(0.7), restitution=alpha)
-        end, _ = advance(
-            flow,
-            replica(states, 0),
-            jnp.int32(STEPS),
-            solver=jg.BarzilaiBorwein(1e-12),
-            engine=engine,
-        )
+        flow, state = replace(flow_of(0.7), restitution=alpha), replica(states, 0)
+        solver = jg.BarzilaiBorwein(1e-12)
+        end, _ = advance(flow, state, jnp.int32(STEPS), solver=solver, engine=engine)
         return jnp.sum(end.velocities**2)
 
-    slope = compiled(jax.jacfwd(partial(energy, engine=jg.Jax())))
-    step = 1e-5
-    numerical = (slope(0.7 + step) - slope(0.7 - step)) / (2 * step)
-    backwards = jax.grad(partial(energy, engine=jg.Jax(events=STEPS + 1)))
-    for curvature in (jax.jacfwd(jax.jacfwd(partial(energy, engine=None))), jax.jacfwd(backwards)):
-        np.testing.assert_allclose(compiled(curvature)(0.7), numerical, rtol=1e-6)
+    step, first = 1e-5, jax.jit(jax.grad(partial(energy, engine=jg.Jax(events=STEPS + 1))))
+    numerical = (first(0.7 + step) - first(0.7 - step)) / (2 * step)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(first))(0.7), numerical, rtol=1e-6)
 
 
-def test_states_that_share_a_flow_advance_with_conditions_of_their_own(states) -> None:
+def test_states_that_share_a_flow_advance_with_conditions_of_their_own(states, alone) -> None:
     """As flows of their own do, whatever is batched: states, flows or both."""
 
     def end(flow, state):
@@ -237,41 +242,20 @@ def test_states_that_share_a_flow_advance_with_conditions_of_their_own(states) -
     of_both = conditions((0, 0), flows, states)
     assert conditions((None, 0), flow, states) == of_both
     assert conditions((0, None), flows, replica(states, 0)) == of_both
-    shared = compiled(lambda states: jax.vmap(partial(end, flow))(states))(states)
-    assert_same(replica(shared, 1), compiled(partial(end, flow))(replica(states, 1)))
+    shared = compiled(jax.vmap(partial(end, replace(flow, restitution=ALPHAS[1]))))(states)
+    assert_same(replica(shared, 1), alone("jax")(ALPHAS[1], replica(states, 1)))
 
 
 @pytest.mark.parametrize("name", ENGINES)
-def test_a_compiled_function_closes_over_flows_of_numpy(name: str, states) -> None:
-    flows, steps = jax.tree.map(np.asarray, stacked([flow_of(0.7)] * 3)), np.array([5, 9, STEPS])
+def test_a_compiled_function_closes_over_flows_of_numpy(name: str, states, alone) -> None:
+    flows = stacked([flow_of(0.7, restitution=alpha) for alpha in ALPHAS])
+    flows, steps = jax.tree.map(np.asarray, flows), np.array([5, 9, STEPS])
 
     def ends(states):
-        run = partial(advance, engine=ENGINES[name])
-        return jax.vmap(run)(flows, states, steps)
+        return jax.vmap(partial(advance, engine=ENGINES[name]))(flows, states, steps)
 
-    alone = compiled(lambda s: advance(flow_of(0.7), s, jnp.int32(STEPS), engine=ENGINES[name]))
-    assert_same(replica(compiled(ends)(states), 2), alone(replica(states, 2)))
-
-
-def test_derivatives_of_replicas_keep_their_conditions(states) -> None:
-    """In every order of ``vmap`` and ``jacfwd``, no condition becomes a choice of both branches."""
-
-    def speed(alpha, state):
-        return jnp.sum(advanced(jg.Jax(), alpha, state)[0].velocities ** 2)
-
-    slope = jax.jacfwd(speed)
-    of_one = str(jax.make_jaxpr(slope)(ALPHAS[0], replica(states, 0))).count(" cond[")
-    for function in (
-        jax.vmap(slope),
-        lambda alphas, states: jax.jacfwd(lambda x: jax.vmap(speed)(x, states))(alphas),
-    ):
-        assert str(jax.make_jaxpr(function)(ALPHAS, states)).count(" cond[") >= of_one > 5
-
-
-def test_the_value_beside_a_derivative_is_that_of_its_trajectory(states) -> None:
-    run = [partial(advanced, ENGINES[name], state=replica(states, 0)) for name in ("numba", "jax")]
-    values = [compiled(lambda x, f=f: jax.jvp(f, (x,), (1.0,)))(0.5) for f in run]
-    assert_same_bits(values[0], values[1])
+    end = replica(compiled(ends)(states), 2)
+    assert_same(end, alone(name)(ALPHAS[2], replica(states, 2)))
 
 
 def test_a_sample_is_differentiated_backwards_with_a_number_of_events(states) -> None:

@@ -308,7 +308,7 @@ def test_a_reader_that_has_gone_ends_a_command_in_silence(tmp_path: Path) -> Non
     [
         "info",
         "where --restitution 0.5 --packing-fraction 0.6",
-        "run --restitution 0.5 --packing-fraction 0.6 -n 16 --strain 1 --equilibrate 0.1",
+        SMALL_RUN,
     ],
 )
 def test_a_command_without_a_standard_output_ends_as_ever(words: str, tmp_path: Path) -> None:

@@ -32,6 +32,12 @@ def seen() -> jg.Snapshot:
     return jax.tree.map(lambda x: jnp.asarray(x[0]), series)
 
 
+def traced_sample(x: Any, state: State) -> jg.Sample:
+    """A sample whose numbers are all one that JAX traces."""
+    shapes = jax.eval_shape(lambda state: jg.sample(FLOW, state, 0.1, blocks=2)[1], state)
+    return jax.tree.map(lambda one: (x + jnp.zeros(one.shape)).astype(one.dtype), shapes)
+
+
 # Functions of one number, and of a state that is closed over.
 TRANSFORMED: dict[str, Callable[[Any, State], Any]] = {
     "advance": lambda x, state: jg.advance(replace(FLOW, restitution=x), state, STEPS),
@@ -64,9 +70,7 @@ REFUSED: dict[str, Callable[[Any, State], Any]] = {
         replace(FLOW, restitution=x), state, state, 9, 1e-3, 1e-3
     ),
     "flow_figure": lambda x, _: jg.flow_figure(replace(seen(), restitution=x)),
-    "Sample": lambda x, state: jg.sample(replace(FLOW, restitution=x), state, 0.1, blocks=2)[
-        1
-    ].errors(),
+    "Sample": lambda x, state: traced_sample(x, state).errors(),
     "ratio_map": lambda x, _: jg.ratio_map([x], [0.6]),
 }
 

@@ -72,8 +72,8 @@ def advance(
       ...     changed = replace(flow, restitution=restitution)
       ...     end, _ = advance(changed, state, jnp.int32(10), engine=engine)
       ...     return jnp.sum(end.velocities**2)
-      >>> forward = jax.jacfwd(energy)(0.5, Jax())
-      >>> backward = jax.grad(energy)(0.5, Jax(events=21))
+      >>> forward = jax.jit(jax.jacfwd(energy), static_argnums=1)(0.5, Jax())
+      >>> backward = jax.jit(jax.grad(energy), static_argnums=1)(0.5, Jax(events=21))
       >>> bool(jnp.isclose(forward, backward))
       True
     """
