@@ -78,7 +78,7 @@ def verdicts(rows: Sequence[Mapping], grains: int) -> dict:
 
     def bound(row: Mapping) -> float:
         crossing = row["timestep"] * np.sqrt(row["temperature"])
-        return float(stress_error(crossing, row["packing_fraction"]))
+        return float(stress_error(crossing, row["packing_fraction"], grains))
 
     finest = min(row["timestep"] for row in rows)
     judged = [row for row in rows if row["timestep"] > finest]

@@ -72,11 +72,12 @@ def chosen(**parameters: Any) -> tuple[MapSettings, str]:
     return chosen_settings(parameters)
 
 
-def test_automatic_time_step_does_not_depend_on_the_numbers_of_grains() -> None:
-    one, several = (
-        chosen(**{**GOOD, "timestep": "auto", "grains": grains}) for grains in (64, (64, 1024))
-    )
-    assert several == (replace(one[0], grains=(64, 1024)), one[1])
+def test_the_automatic_time_step_of_several_numbers_of_grains_is_that_of_the_fewest() -> None:
+    """Which jam at lower packing fractions."""
+    dense = {**GOOD, "packing_fraction": (0.8,), "timestep": "auto"}
+    few, many, several = (chosen(**{**dense, "grains": n}) for n in (64, 1024, (64, 1024)))
+    assert several == (replace(few[0], grains=(64, 1024)), few[1])
+    assert few[0].timestep[0] < 0.7 * many[0].timestep[0]
 
 
 def test_the_automatic_time_step_is_the_shortest_that_a_point_needs() -> None:

@@ -275,7 +275,10 @@ def _timestep_for(settings: MapSettings, error: float, strain: Any) -> tuple[flo
     """
     flows = stack_of_any_size(settings.flows.values())
     temperature = temperature_of(settings, flows)
-    longest = automatic_timestep(temperature, flows.packing_fraction, flows.activation, error)
+    grains = [flow.grains for flow in settings.flows.values()]
+    longest = automatic_timestep(
+        temperature, flows.packing_fraction, flows.activation, grains, error
+    )
     steps = (
         np.minimum(longest, strain / FEWEST_STEPS) if isinstance(strain, int | float) else longest
     )

@@ -158,7 +158,7 @@ def sampling_target(
     """
     flow = restitution, packing_fraction, grains
     size = np.maximum(size_error(*flow), size_error(*flow, "shear_stress"))
-    others = size**2 + stress_error(crossing, packing_fraction) ** 2
+    others = size**2 + stress_error(crossing, packing_fraction, grains) ** 2
     left = error**2 - others - (RESIDUAL_FACTOR * tolerance) ** 2
     return np.sign(left) * np.sqrt(np.abs(left)) / HALF_INTERVAL
 
@@ -186,7 +186,8 @@ def large_system(
     flow = restitution, packing_fraction, grains
     temperature = np.asarray(values["granular_temperature"], float)
     with np.errstate(invalid="ignore", divide="ignore"):
-        step = stress_error(np.asarray(timestep) * np.sqrt(temperature), packing_fraction)
+        crossing = np.asarray(timestep) * np.sqrt(temperature)
+        step = stress_error(crossing, packing_fraction, grains)
         contact = np.asarray(values["contact_stress"])
         in_contacts = (contact[..., 0, 0] + contact[..., 1, 1]) / 2 / np.asarray(values["pressure"])
     solve = RESIDUAL_FACTOR * np.asarray(tolerance) * in_contacts

@@ -133,7 +133,7 @@ class Sample(Observables, Indexable):
         flow, mass, area = in_numpy((self.flow, self.mass, self.area))
         of_unit_diameter = mass / mass_of_grains(flow.packing_fraction, area)
         temperature = self.averages["granular_temperature"] / of_unit_diameter
-        return stress_error(flow.timestep * temperature**0.5, flow.packing_fraction)
+        return stress_error(flow.timestep * temperature**0.5, flow.packing_fraction, flow.grains)
 
     @property
     def status(self) -> Int[Array | np.ndarray, "*replicas"]:
