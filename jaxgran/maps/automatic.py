@@ -275,7 +275,7 @@ def _timestep_for(settings: MapSettings, error: float, strain: Any) -> tuple[flo
     """
     flows = stack_of_any_size(settings.flows.values())
     temperature = temperature_of(settings, flows)
-    grains = [flow.grains for flow in settings.flows.values()]
+    grains = np.array([flow.grains for flow in settings.flows.values()])
     longest = automatic_timestep(
         temperature, flows.packing_fraction, flows.activation, grains, error
     )
