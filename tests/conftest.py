@@ -44,7 +44,8 @@ hypothesis.settings.load_profile("tests")
 
 @pytest.fixture(autouse=True, scope="module")
 def garbage() -> Iterator[None]:
-    """Collected after each file: while JAX traces, collections take a third of the time."""
+    """Collected after each file: while JAX traces, collections take up to a third of the time."""
     gc.disable()
     yield
     gc.collect()
+    gc.freeze()  # what is left is seldom garbage later
