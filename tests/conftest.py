@@ -5,10 +5,8 @@ Programs are kept in ``.pytest_cache/jaxgran``, or in the folder that ``JAXGRAN_
 by the package's own caches. Both folders may be deleted at any time.
 """
 
-import gc
 import os
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 FOLDER = (
@@ -24,7 +22,6 @@ os.environ.pop("COLUMNS", None)  # pytest-xdist sets it, and tables would take t
 
 import hypothesis  # noqa: E402
 import jax  # noqa: E402
-import pytest  # noqa: E402
 
 from jaxgran.cache.folder import use_cache  # noqa: E402
 
@@ -40,12 +37,3 @@ hypothesis.settings.register_profile(
     "tests", deadline=None, derandomize=True
 )  # the same examples at any speed
 hypothesis.settings.load_profile("tests")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def garbage() -> Iterator[None]:
-    """Collected after each file: while JAX traces, collections take up to a third of the time."""
-    gc.disable()
-    yield
-    gc.collect()
-    gc.freeze()  # what is left is seldom garbage later

@@ -14,7 +14,7 @@ In one step dt a grain of thermal speed moves by x = dt √T/σ. The errors foll
 
 Kinetic theory underestimates the temperature of dense flows: close to jamming the geometry drives
 the grains, for any restitution. The numbers here are bounds on what ``python -m benchmarks
-stability`` and ``python -m benchmarks speed_vs_accuracy`` find for this size distribution. They
+timestep_error``, ``stability`` and ``speed_vs_accuracy`` find for this size distribution. They
 serve to choose a time step and are not results.
 """
 
@@ -114,7 +114,9 @@ def automatic_timestep(
     grains: ArrayLike,
     target_error: float,
 ) -> np.ndarray:
-    """Longest time step, in t, with a stress error within the target and no deep overlap."""
+    """Longest time step, in t, with a stress error within the target, and at most
+    ``longest_timestep``. Contacts overlap deeply where a target above 5 % is reached.
+    """
     crossing = target_error / stress_error(1.0, packing_fraction, grains)
     accurate = crossing / np.sqrt(np.asarray(temperature))
     return np.minimum(accurate, longest_timestep(temperature, packing_fraction, activation))
