@@ -87,6 +87,28 @@ def test_errors_of_time_steps_are_within_the_bound_and_their_noise() -> None:
         assert abs(row["error"]) < bound + 3 * row["error_stderr"], row
 
 
+def test_errors_of_the_committed_chart_of_whole_runs_are_within_the_bound_and_its_noise() -> None:
+    chart, compared = json.loads((RESULTS / "speed_vs_accuracy.json").read_text()), 0
+    for flow in chart["flows"]:
+        for row in flow["rows"]:
+            if row["curve"] != "jaxgran":
+                continue
+            temperature = row["values"]["granular_temperature"][0]
+            crossing = row["setting"] * np.sqrt(temperature)
+            if crossing > 5e-3:
+                continue
+            compared += 1
+            bound = stress_error(crossing, flow["packing_fraction"], flow["discs"])
+            for name in ("pressure", "shear_stress"):
+                error, noise = row["errors"][name]
+                assert abs(error) < bound + 3 * noise + 0.01, (
+                    flow["packing_fraction"],
+                    row["setting"],
+                    name,
+                )
+    assert compared > 2 * len(chart["flows"])
+
+
 def test_the_bound_grows_where_few_grains_may_jam() -> None:
     bounds = stress_error(1e-3, 0.8, np.array([1e9, 4096, 256, 64]))
     assert bounds[0] == pytest.approx(1e-3 * 1.6 / 0.0386, rel=1e-3) and np.all(np.diff(bounds) > 0)

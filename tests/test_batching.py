@@ -60,8 +60,9 @@ def test_replicas_of_a_vmap_have_the_bits_of_each_alone(name: str, states, alone
     run = partial(advanced, ENGINES[name])
     together = compiled(jax.vmap(run))(ALPHAS, states)
     crossed = compiled(jax.vmap(jax.vmap(run, (0, None)), (None, 0)))(ALPHAS, states)
+    mapped = compiled(lambda *batch: lax.map(lambda one: run(*one), batch))(ALPHAS, states)
     for k, alpha in enumerate(ALPHAS):
-        for batch in (together, replica(crossed, k)):
+        for batch in (together, mapped, replica(crossed, k)):
             assert_same(replica(batch, k), alone(name)(alpha, replica(states, k)))
 
 
@@ -123,7 +124,9 @@ def test_forward_derivatives_are_those_of_finite_differences(states, alone, slop
     np.testing.assert_allclose(slopes[0][0], numerical, rtol=1e-4)
 
 
-@pytest.mark.parametrize("order", ["numba, vmap of jvp", "jax, vmap of jvp", "jax, jacfwd of vmap"])
+@pytest.mark.parametrize(
+    "order", [f"{name}, {order}" for name in ENGINES for order in ("vmap of jvp", "jacfwd of vmap")]
+)
 def test_forward_derivatives_follow_replicas_with_conditions_of_their_own(
     order: str, states, slopes
 ) -> None:
@@ -144,8 +147,9 @@ def test_forward_derivatives_follow_replicas_with_conditions_of_their_own(
 
 
 def test_reverse_mode_without_a_number_of_events_is_refused(states) -> None:
-    with pytest.raises(ValueError, match="Reverse-mode"):
-        jax.jit(jax.grad(lambda x: advanced(jg.Numba(), x, replica(states, 0))[1].impulse))(0.5)
+    for each in ENGINES.values():
+        with pytest.raises(ValueError, match="Reverse-mode"):
+            jax.jit(jax.grad(lambda x, e=each: advanced(e, x, replica(states, 0))[1].impulse))(0.5)
 
 
 def test_reverse_mode_of_a_batch_takes_the_number_of_events(states, slopes) -> None:
@@ -225,7 +229,9 @@ def test_second_derivatives_are_those_of_the_first_ones(states) -> None:
 
     step, first = 1e-5, jax.jit(jax.grad(partial(energy, engine=jg.Jax(events=STEPS + 1))))
     numerical = (first(0.7 + step) - first(0.7 - step)) / (2 * step)
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(first))(0.7), numerical, rtol=1e-6)
+    forward = jax.jacfwd(jax.jacfwd(partial(energy, engine=None)))
+    for curvature in (forward, jax.jacfwd(first)):
+        np.testing.assert_allclose(jax.jit(curvature)(0.7), numerical, rtol=1e-6)
 
 
 def test_states_that_share_a_flow_advance_with_conditions_of_their_own(states, alone) -> None:

@@ -118,9 +118,10 @@ def test_a_number_of_steps_may_be_one_of_python(engine, flowing) -> None:
     assert_same_bits(one, third)
 
 
-def test_for_another_solver_the_plain_advance_runs(flowing) -> None:
-    solver = jg.Jacobi()
-    chosen = compiled(partial(jg.advance, solver=solver))(of(), flowing(0.7), STEPS)
+@pytest.mark.parametrize("numerics", [{"engine": jg.Jax()}, {"solver": jg.Jacobi()}])
+def test_jax_by_name_and_for_another_solver_is_the_plain_advance(numerics, flowing) -> None:
+    solver = numerics.get("solver", jg.BarzilaiBorwein())
+    chosen = compiled(partial(jg.advance, **numerics))(of(), flowing(0.7), STEPS)
     assert_same_bits(chosen, compiled(advance_by_jax)(of(), solver, flowing(0.7), STEPS))
 
 
