@@ -430,7 +430,7 @@ def peer_run(peer: Any, case: Case, setting: float, state: jg.State) -> Run:
 
 OF_TWO, OF_THREE = 0.27, 0.38  # inches: height of a row with two or three lines of text
 # Colours of a cell, and what they say
-RIGHT_OK, RIGHT_WARNED, WRONG_WARNED, WRONG_SILENT, FAILED, UNKNOWN = (
+RIGHT_OK, RIGHT_WARNED, WRONG_WARNED, WRONG_SILENT, FAILED, UNDECIDED = (
     *("#d9e6d2", "#fff2b3", "#f7c77f", "#d7301f", "#d9d9d9", "white"),
 )
 MEANINGS = {
@@ -438,7 +438,8 @@ MEANINGS = {
     RIGHT_WARNED: "within, status deep_overlap",
     WRONG_WARNED: "wrong, status deep_overlap",
     WRONG_SILENT: "wrong, no status",
-    FAILED: "failed with a message, or undecided",
+    FAILED: "failed with a message",
+    UNDECIDED: "undecided",
 }
 LETTERS = {
     EVENT_DRIVEN: ("c", "inelastic collapse"),
@@ -474,14 +475,14 @@ def cell_of(row: dict, names: Sequence[str]) -> tuple[str, str]:
     if not errors:
         if row["failure"]:
             return LETTERS["too_slow"][0], FAILED
-        return LETTERS["runs"][0], WRONG_WARNED if warned else UNKNOWN
+        return LETTERS["runs"][0], WRONG_WARNED if warned else UNDECIDED
     error, noise = max(errors, key=lambda pair: abs(pair[0]))
     text = f"{100 * error:+.0f}" if abs(error) >= 0.0995 else f"{100 * error:+.1f}"
     text = text.replace("-", "−")
     if not noise <= PRECISION:
         text += f"\n±{100 * noise:.2g}"
         if not abs(abs(error) - RIGHT) >= 2 * noise:
-            return text, FAILED
+            return text, UNDECIDED
     colours = (WRONG_SILENT, WRONG_WARNED), (RIGHT_OK, RIGHT_WARNED)
     return text, colours[abs(error) <= RIGHT][warned]
 
@@ -532,7 +533,7 @@ def draw(rows: list[dict]) -> Figure:
     axes.spines[:].set_visible(False)
     known = "; ".join(f"{x}: {meaning}" for x, meaning in LETTERS.values() if x in letters)
     figure.legend(
-        handles=[Patch(color=colour, label=words) for colour, words in MEANINGS.items()],
+        handles=[Patch(fc=colour, ec="0.6", lw=0.5, label=x) for colour, x in MEANINGS.items()],
         loc="outside lower center",
         ncols=3,
         fontsize=SMALL_SIZE,

@@ -44,6 +44,12 @@ LOOKS = {
     "event-driven": Look("event-driven, hard discs", "tab:blue", "*", ""),
     "TC model": Look("event-driven, TC model", "tab:blue", "P"),
 }
+FIRST = {
+    "jaxgran": (r"\mathrm{d}t", (-4, 0)),
+    "LAMMPS": ("k", (-4, 0)),
+    "TC model": ("t_c", (4, 2)),
+}
+"""The symbol of a setting, and where the coarsest is written beside its point, in points."""
 
 
 @styled
@@ -76,6 +82,13 @@ def draw(result: dict) -> Figure:
         ]
         place = {"transform": panels[0, column].transAxes, "fontsize": SMALL_SIZE}
         panels[0, column].text(0.97, 0.96, "\n".join(failed), ha="right", va="top", **place)
+    for curve, (symbol, away) in FIRST.items():
+        if rows := rows_of(flows[-1], curve):
+            at = 1e6 * rows[0][COST] / flows[-1]["discs"], abs(rows[0]["errors"]["pressure"][0])
+            look = {"color": LOOKS[curve].colour, "fontsize": SMALL_SIZE, "va": "center"}
+            look |= {"textcoords": "offset points", "ha": "right" if away[0] < 0 else "left"}
+            setting = f"${symbol}=10^{{{np.log10(rows[0]['setting']):.0f}}}$"
+            panels[0, -1].annotate(setting, at, away, **look)
     for axes, words in zip(panels[:, 0], OBSERVABLES.values(), strict=True):
         axes.set_ylabel(f"|error of the {words}|")
         axes.yaxis.set_major_locator(FixedLocator([0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1]))
