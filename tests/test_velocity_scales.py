@@ -88,13 +88,14 @@ def test_neither_depends_on_the_image_of_a_grain_or_on_the_cell_that_describes_t
         )
 
 
-def test_few_grains_are_one_box():
-    velocities = np.random.default_rng(2).normal(size=(16, 2))
-    grains = Grains(jnp.full(16, 0.5), jnp.ones(16))
-    positions = jnp.asarray(np.random.default_rng(4).uniform(0, 5, (16, 2)))
+@pytest.mark.parametrize("count", [2, 16])
+def test_few_grains_are_one_box(count):
+    velocities = np.random.default_rng(2).normal(size=(count, 2))
+    grains = Grains(jnp.full(count, 0.5), jnp.ones(count))
+    positions = jnp.asarray(np.random.default_rng(4).uniform(0, 5, (count, 2)))
     state = State(grains, positions, jnp.asarray(velocities), jnp.asarray(5.0), jnp.asarray(0.0))
     np.testing.assert_allclose(
-        local_temperature(state), np.sum(np.var(velocities, axis=0)) / 2 * 16 / 15
+        local_temperature(state), np.sum(np.var(velocities, axis=0)) / 2 * count / (count - 1)
     )
 
 
