@@ -20,13 +20,7 @@ import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.analysis.contacts import ForceNetwork, cluster_share, clusters
 from jaxgran.dynamics.snapshot import Snapshot
-from jaxgran.plotting.flow import (
-    add_colour_bar,
-    common_scale,
-    draw_flow,
-    force_key,
-    network_of,
-)
+from jaxgran.plotting.flow import add_colour_bar, common_scale, draw_flow, force_key, network_of
 from jaxgran.plotting.movie import Frames, write_movie
 from jaxgran.plotting.style import TWO_COLUMNS, empty_figure, styled
 

@@ -152,7 +152,7 @@ def grains_for(error: float, restitution: float, packing_fraction: float) -> int
             "timestep": "auto",
         }
     )
-    return settings.sizes[-1]
+    return settings.grains[-1]
 
 
 def percent_pm(value_and_error: Iterable[float]) -> str:

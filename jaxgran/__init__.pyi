@@ -5,12 +5,7 @@ from .analysis.fit import fit_trajectory
 from .analysis.jax_md_space import jax_md_space
 from .cache.folder import use_cache
 from .contact.problem import ContactNetwork, DelassusProblem
-from .contact.projected_methods import (
-    BarzilaiBorwein,
-    Jacobi,
-    Nesterov,
-    ProjectedMethod,
-)
+from .contact.projected_methods import BarzilaiBorwein, Jacobi, Nesterov, ProjectedMethod
 from .contact.solve_contacts import solve_contacts
 from .dynamics.advance import advance, count_events
 from .dynamics.engine import Jax, Numba

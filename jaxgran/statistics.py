@@ -165,7 +165,7 @@ def _influences(
     def whole_and_parts(x: np.ndarray) -> np.ndarray:
         parts = _joined(x, counts)
         whole = parts.sum(axis=0)[None]
-        return np.concatenate([whole, _all_but_one(parts)]) if total > 1 else whole
+        return np.concatenate([whole, whole - parts]) if total > 1 else whole  # then without each
 
     flat, by_name = _flat(estimate(jax.tree.map(whole_and_parts, sums)))
     without = flat[1:].astype(float) if total > 1 else np.full(flat.shape, np.nan)
@@ -256,11 +256,6 @@ def _half_width(
         slope = np.sum(weight / width * density, axis=(0, 1))
         half = np.clip(half - excess / slope, half / 2, 2 * half)
     return half
-
-
-def _all_but_one(groups: np.ndarray) -> np.ndarray:
-    """Leave-one-out sums, (groups, ...)."""
-    return groups.sum(axis=0) - groups
 
 
 def _flat(estimates: Mapping[str, Any]) -> tuple[np.ndarray, Callable[[np.ndarray], Estimates]]:

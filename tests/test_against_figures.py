@@ -9,12 +9,8 @@ from made_up_maps import ratio_dataset, with_grains, with_timesteps
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 
-from jaxgran.maps.schema import finest, parts
-from jaxgran.plotting.against import (
-    MOST_CURVES,
-    averages_against_grains,
-    ratio_against_timestep,
-)
+from jaxgran.maps.schema import parts
+from jaxgran.plotting.against import MOST_CURVES, averages_against_grains, ratio_against_timestep
 
 SIZES = (256, 1000, 4000)
 NAMES = ("pressure", "granular_temperature", "force_ratio")
@@ -67,5 +63,3 @@ def test_parts_are_the_maps_at_every_number_of_grains_and_time_step() -> None:
     found = [(part.attrs["grains"], part.attrs["timestep"]) for part in parts(several)]
     assert found == [(n, dt) for n in SIZES for dt in (1e-3, 1e-4)]
     assert parts(data)[0].identical(data)
-    assert finest(several).identical(parts(several)[-1])
-    assert set(finest(several, "grains").sizes) == {"timestep", "packing_fraction", "restitution"}

@@ -17,7 +17,6 @@ from jaxgran.sampling.budget import (
     jamming_error,
     large_system,
     sampling_target,
-    size_error,
 )
 from jaxgran.sampling.timestep import JAMMING, stress_error
 
@@ -85,7 +84,7 @@ def test_error_of_a_correction_falls_with_the_number_of_grains() -> None:
     for name in SIZE_LAWS:
         for alpha in (0.1, 0.5, 0.98):
             for nu in (0.1, 0.6, 0.75, 0.82):
-                errors = size_error(alpha, nu, sizes, name)
+                errors = SIZE_LAWS[name].error(alpha, nu, sizes)
                 assert np.all(np.diff(errors) < 0) and 0 < errors[-1] < errors[0] < 1.5
 
 

@@ -12,12 +12,7 @@ import pytest
 
 from benchmarks.output import RESULTS
 from jaxgran.sampling.timestep import JAMMING
-from jaxgran.theory.corrected_shear import (
-    MEASURED_LAWS,
-    SCATTER,
-    CorrectedShear,
-    corrected_shear,
-)
+from jaxgran.theory.corrected_shear import MEASURED_LAWS, SCATTER, CorrectedShear, corrected_shear
 from jaxgran.theory.enskog import collisional_transfer
 from jaxgran.theory.gaussian_moments import gaussian_moments
 

@@ -19,7 +19,7 @@ from jaxgran.maps.schema import flattened, path_of
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.variables import NOT_RUN, PREDICTED
 from jaxgran.model.status import Status
-from jaxgran.sampling.budget import large_system, size_error
+from jaxgran.sampling.budget import SIZE_LAWS, large_system
 from jaxgran.sampling.enskog_factors import LENGTHS, measured_over_enskog
 from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.sample import BLOCKS
@@ -276,7 +276,8 @@ def test_grains_chosen_by_point_are_in_the_file_and_change_the_error(tmp_path: P
     half_width = data.pressure_large_system_ci95.sel(error_source="size")
     relative = (half_width / abs(data.pressure_large_system)).values.ravel()
     points = zip(product(NUS, ALPHAS), by_point, strict=True)
-    expected = [float(size_error(alpha, nu, grains)) for (nu, alpha), grains in points]
+    law = SIZE_LAWS["pressure"]
+    expected = [float(law.error(alpha, nu, grains)) for (nu, alpha), grains in points]
     np.testing.assert_allclose(relative, expected, rtol=1e-6)
     write_dataset(with_variables(data, *FEW), tmp_path / "map.nc")
     assert MapSettings(**from_attrs(open_map(tmp_path / "map.nc"))) == chosen

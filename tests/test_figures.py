@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from drawn import contour_lines
-from made_up_maps import (
-    RATE,
-    excess_of,
-    ratio_dataset,
-    theory_dataset,
-    with_grains,
-    with_timesteps,
-)
+from made_up_maps import RATE, excess_of, ratio_dataset, theory_dataset, with_grains, with_timesteps
 from matplotlib import _pylab_helpers, rc_context, rcParams
 from matplotlib.colors import same_color
 from matplotlib.container import ErrorbarContainer

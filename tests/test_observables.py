@@ -162,7 +162,7 @@ def test_leading_axes_are_kept() -> None:
     tally = random_tally(np.random.default_rng(1), 3, 4)
     values = averages(tally, np.full((3, 4), AREA), GRAINS, np.full((3, 4), SHEAR_RATE))
     for name, value in values.items():
-        assert value.shape == (3, 4, *OBSERVABLES[name].shape), name
+        assert value.shape == (3, 4, *OBSERVABLES[name].tensor * (2, 2)), name
 
 
 def test_quotient_of_nothing_is_nan_without_a_warning() -> None:
@@ -182,4 +182,5 @@ def test_quotient_of_nothing_is_nan_without_a_warning() -> None:
 def test_every_observable_is_measured_with_a_unit(measured) -> None:
     assert set(measured) == set(OBSERVABLES)
     for name, observable in OBSERVABLES.items():
-        assert observable.meaning and observable.unit and measured[name].shape == observable.shape
+        assert observable.meaning and observable.unit
+        assert measured[name].shape == observable.tensor * (2, 2)

@@ -29,7 +29,7 @@ from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.settings import OPTIONS, MapSettings
 from jaxgran.maps.start import with_start
 from jaxgran.model.checks import InputError
-from jaxgran.sampling.budget import size_error
+from jaxgran.sampling.budget import SIZE_LAWS
 from jaxgran.sampling.timestep import COARSE_TIMESTEP
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
@@ -132,7 +132,8 @@ def test_an_error_chooses_grains_by_point_and_one_time_step() -> None:
     settings, sentence = chosen(**given, grains="auto", timestep="auto")
     flows = list(settings.flows.values())
     for flow in flows:
-        assert size_error(flow.restitution, flow.packing_fraction, flow.grains) < 0.1
+        law = SIZE_LAWS["pressure"]
+        assert law.error(flow.restitution, flow.packing_fraction, flow.grains) < 0.1
         assert np.all(sampling_targets(settings, stack([flow])) > 0.02 / 1.96)
     assert len({flow.grains for flow in flows}) > 1
     assert f"{settings.grains[0]} grains, 1 seed" in sentence and "error of 0.1" in sentence

@@ -8,11 +8,7 @@ import pytest
 from flows import GRAINS
 from synthetic import SNAPSHOTS, snapshot_of
 
-from jaxgran.analysis.contacts import (
-    cluster_share,
-    clusters,
-    loaded_contacts,
-)
+from jaxgran.analysis.contacts import cluster_share, clusters, loaded_contacts
 from jaxgran.analysis.series import series
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.snapshot import Snapshot

@@ -24,12 +24,7 @@ from jaxgran.dynamics.batch import stack
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.io import trajectory
-from jaxgran.io.trajectory import (
-    Trajectory,
-    read_trajectory,
-    write_frame,
-    write_trajectory,
-)
+from jaxgran.io.trajectory import Trajectory, read_trajectory, write_frame, write_trajectory
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status

@@ -40,11 +40,7 @@ MAP_OPTIONS = {
 }
 PLOT_OPTIONS = {
     "output": Option(
-        "Folder of the figures.",
-        Path,
-        default="that of the dataset",
-        short="o",
-        example="FOLDER",
+        "Folder of the figures.", Path, default="that of the dataset", short="o", example="FOLDER"
     ),
     "format": Option("Format of the figures.", get_args(FileFormat), default="png"),
     "dpi": Option("Dots per inch of a PNG, 50 to 1200.", int, default="200"),

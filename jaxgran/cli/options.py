@@ -16,7 +16,8 @@ import typer
 from jaxgran.cli.terminal import run_command
 from jaxgran.maps.options import Command, Option
 from jaxgran.maps.presets import PRESETS
-from jaxgran.maps.settings import DEFAULTS, OPTIONS, is_new_dimension, options, rounded
+from jaxgran.maps.replica import FURTHER
+from jaxgran.maps.settings import DEFAULTS, OPTIONS, options, rounded
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import MAX_REPLICAS
 
@@ -45,7 +46,7 @@ def _as_offered(name: str, row: Option, command: Command) -> Option:
         text = f"{start:g}" if isinstance(start, float) else str(start)
     if command == "run":
         return replace(row, default=text, several=name == "grains")
-    words = " Several add a dimension." if is_new_dimension(name) else ""
+    words = " Several add a dimension." if name in FURTHER else ""
     return replace(row, default=text, help=row.help + words)
 
 
@@ -136,7 +137,7 @@ def parse(name: str, row: Option, text: str) -> Any:
         *others, last = accepted
         words = f"{', '.join(others)} or {last}" if others else last
         raise typer.BadParameter(f"must be {words}, not {text!r}.") from None
-    is_list = row.values or (row.several and not is_new_dimension(name))
+    is_list = row.values or (row.several and name not in FURTHER)
     return tuple(numbers) if len(numbers) > 1 or is_list else numbers[0]
 
 

@@ -33,15 +33,9 @@ RUN_EXAMPLES = {
 
 RUN_OPTIONS = {
     **of_map("run"),
-    "trajectory": Option(
-        "Record the flow in a GSD file.",
-        Path,
-        example="FILE.gsd",
-    ),
+    "trajectory": Option("Record the flow in a GSD file.", Path, example="FILE.gsd"),
     "movie": Option(
-        "Record a movie of the grains and their forces, GIF or MP4.",
-        Path,
-        example="FILE.gif",
+        "Record a movie of the grains and their forces, GIF or MP4.", Path, example="FILE.gif"
     ),
     "frame_strain": Option(
         "Strain between frames.",

@@ -42,12 +42,7 @@ def summary_of(data: Any) -> dict[str, Entry]:
     theory predicts, by name, as far as the data have them; lists are by packing fraction, then by
     restitution.
     """
-    from jaxgran.maps.schema import (
-        flag_names,
-        flattened,
-        path_of,
-        shear_stress_ratio,
-    )
+    from jaxgran.maps.schema import flag_names, flattened, path_of, shear_stress_ratio
     from jaxgran.maps.variables import SCALARS
     from jaxgran.sampling.enskog_factors import LENGTHS
     from jaxgran.sampling.observables import OBSERVABLES

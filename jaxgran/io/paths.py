@@ -3,10 +3,18 @@
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from jaxgran.model.checks import InputError, refused, short_repr
 
 _LONGEST_NAME = 200  # bytes; file systems accept 255, and temporary files have longer names
+
+
+def as_path(name: str, value: Any) -> Path:
+    """The path of a file name; InputError if it is none."""
+    if not isinstance(value, (str, os.PathLike)):
+        raise refused(name, value, "must be a file name")
+    return Path(value)
 
 
 def require_place(path: Path, option: str, ending: str) -> None:

@@ -56,7 +56,7 @@ from jaxgran.dynamics.engine import checked_numerics
 from jaxgran.dynamics.snapshot import Snapshot
 from jaxgran.dynamics.snapshots import snapshots_from
 from jaxgran.files import atomic_write, other_version
-from jaxgran.io.paths import require_absent, require_place
+from jaxgran.io.paths import as_path, require_absent, require_place
 from jaxgran.model.cell import centred, remap_tilt
 from jaxgran.model.checks import InputError, at_most, refused, require_number, short_repr
 from jaxgran.model.flow import ShearFlow, require_sheared, steps_of_strain
@@ -171,7 +171,7 @@ def write_trajectory(
       UserWarning: contact forces of a frame are missing or not converged, see ``status`` of
         ``Trajectory``.
     """
-    path = _as_path(path)
+    path = as_path("path", path)
     check_trajectory(path)
     if not overwrite:
         require_absent(path, "path")
@@ -242,12 +242,6 @@ def _steps_of_frames(flow: ShearFlow, states: State, strains: np.ndarray) -> lis
     return steps.astype(int).tolist()
 
 
-def _as_path(path: str | os.PathLike) -> Path:
-    if not isinstance(path, (str, os.PathLike)):
-        raise refused("path", path, "must be a file name")
-    return Path(path)
-
-
 def _append(path: Path, snapshots: Snapshot, step: int) -> None:
     """Append the first of one or more snapshots, with the mean forces of all; step 0 is a new
     file.
@@ -312,7 +306,7 @@ def read_trajectory(path: str | os.PathLike) -> Trajectory:
       InputError: (a ValueError) the file does not exist, is not such a trajectory, or has another
         version of the format; the message says why.
     """
-    path = _as_path(path)
+    path = as_path("path", path)
     name = short_repr(str(path))
     if not path.is_file():
         raise InputError(f"there is no file {name}.")

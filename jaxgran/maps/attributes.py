@@ -6,7 +6,7 @@ numbers of the solver and a hash of what the function computes: these are what i
 
 import hashlib
 import json
-from collections.abc import Container, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
@@ -139,10 +139,10 @@ def digest(values: Mapping[str, Any]) -> str:
 
 
 def first_difference(
-    values: Mapping[str, Any], others: Mapping[str, Any], but: Container[str] = ()
+    values: Mapping[str, Any], others: Mapping[str, Any]
 ) -> tuple[str, Any, Any] | None:
     """The first name with another value in ``others``, and both values; None if there is none."""
     for name, value in values.items():
-        if name not in but and others.get(name) != value:
+        if others.get(name) != value:
             return name, value, others.get(name)
     return None

@@ -14,12 +14,7 @@ from jaxgran.maps.batches import replica_cost, replica_ids
 from jaxgran.maps.progress import duration
 from jaxgran.maps.replica import Point
 from jaxgran.maps.settings import OPTIONS, MapSettings, rounded
-from jaxgran.maps.settings_checks import (
-    FEWEST_STEPS,
-    point_text,
-    stack_of_any_size,
-    temperature_of,
-)
+from jaxgran.maps.settings_checks import FEWEST_STEPS, point_text, stack_of_any_size, temperature_of
 from jaxgran.model.checks import InputError, refused, two_digits
 from jaxgran.model.choices import HALF_INTERVAL, MAX_GRAINS, MAX_REPLICAS
 from jaxgran.model.display import to_two_digits
@@ -67,10 +62,21 @@ class Plan(NamedTuple):
 
 
 def cheapest(settings: MapSettings, error: float) -> Plan:
-    """The numbers of grains (points,) that reach an error at the least cost."""
+    """The numbers of grains (points,) that reach an error at the least cost; InputError where none
+    reaches it.
+    """
     plans = plans_of_sizes(settings, error, _SIZES[_SIZES <= MAX_GRAINS])
     best = np.argmin(plans.seconds, axis=1)
-    return Plan(*(x[np.arange(len(best)), best] for x in plans))
+    plan = Plan(*(x[np.arange(len(best)), best] for x in plans))
+    if not np.isfinite(plan.seconds).all():
+        worst = int(np.argmax(plan.seconds))
+        where = point_text(stack_of_any_size(settings.flows.values()), worst)
+        reason = (
+            f"is out of reach at {where} with up to {MAX_GRAINS} grains; take a larger one, more "
+            "seeds or a shorter time step"
+        )
+        raise refused("error", error, reason)
+    return plan
 
 
 def plans_of_sizes(settings: MapSettings, error: float, sizes: np.ndarray) -> Plan:
@@ -228,32 +234,20 @@ def chosen_settings(parameters: Mapping[str, Any]) -> tuple[MapSettings, str]:
         if checked.error is None:
             raise InputError("`grains='auto'` requires `error`.", field="grains", value="auto")
         timestep = chosen.get("timestep", checked.timestep)
-        plan = _plan(replace(checked, timestep=timestep), checked.error)
+        plan = cheapest(replace(checked, timestep=timestep), checked.error)
         of_flow = plan.grains.reshape(len(checked.timestep), -1).max(axis=0)
         by_point = (*of_flow.tolist(),) * len(checked.timestep)  # dt compare at one N
         chosen |= {"grains": max(by_point), "grains_by_point": by_point}
+        seconds = plan.seconds.sum()
+        time = f"about {duration(seconds)}" if seconds > 10 else "a few seconds"
         notes = [
             f"{_range(plan.grains)} grains, {checked.seeds} seed{'s' if checked.seeds > 1 else ''}",
             *notes,
             f"strains of about {_range(plan.strain)} for each seed",
-            f"{_time(plan.seconds.sum())} of processor time",
+            f"{time} of processor time",
         ]
     sentence = f"{'; '.join(notes)}: for a relative error of {aim} in force ratio and stresses."
     return MapSettings(**chosen), sentence
-
-
-def _plan(settings: MapSettings, error: float) -> Plan:
-    """``cheapest``; InputError where nothing reaches the error."""
-    plan = cheapest(settings, error)
-    if not np.isfinite(plan.seconds).all():
-        worst = int(np.argmax(plan.seconds))
-        where = point_text(stack_of_any_size(settings.flows.values()), worst)
-        reason = (
-            f"is out of reach at {where} with up to {MAX_GRAINS} grains; take a larger one, more "
-            "seeds or a shorter time step"
-        )
-        raise refused("error", error, reason)
-    return plan
 
 
 def _range(numbers: np.ndarray) -> str:
@@ -263,10 +257,6 @@ def _range(numbers: np.ndarray) -> str:
         {*map(str if exact else to_two_digits, (numbers.min(), numbers.max()))}, key=float
     )
     return " to ".join(ends)
-
-
-def _time(seconds: float) -> str:
-    return f"about {duration(seconds)}" if seconds > 10 else "a few seconds"
 
 
 def _timestep_for(settings: MapSettings, error: float, strain: Any) -> tuple[float, str]:

@@ -21,13 +21,13 @@ from jaxgran.io.arrays import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps.replica import ReplicaId
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
-from jaxgran.sampling.observe import Observe, ObserveBatch, observed_shapes
+from jaxgran.sampling.observe import AdvanceBatch, Observe, observed_shapes
 
 SECONDS = 60.0  # shortest time before the first write and between two
 
 
 class KeptBlocks:
-    """An ``ObserveBatch`` that keeps what another one returns, and first returns what was kept of
+    """An ``AdvanceBatch`` that keeps what another one returns, and first returns what was kept of
     an earlier run.
 
     Args:
@@ -39,7 +39,7 @@ class KeptBlocks:
       CorruptFile: the file is that of another batch, or cannot be read.
     """
 
-    def __init__(self, path: Path, replicas: Sequence[ReplicaId], advance: ObserveBatch):
+    def __init__(self, path: Path, replicas: Sequence[ReplicaId], advance: AdvanceBatch):
         self.path, self.advance = path, advance
         self.about = {"replicas": [list(replica) for replica in replicas]}
         self.steps: list[np.ndarray] = []

@@ -5,7 +5,7 @@ have died too often.
 """
 
 import logging
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -13,7 +13,7 @@ import jax
 from jaxgran.cache.folder import programs_folder, use_cache
 from jaxgran.environment import precision
 from jaxgran.maps.attributes import first_difference
-from jaxgran.maps.provenance import made_with, versions_of
+from jaxgran.maps.provenance import deciding, made_with
 from jaxgran.model.checks import InputError
 
 T = TypeVar("T")
@@ -55,7 +55,7 @@ def run_on_cluster(
             f"no scheduler answers at {address!r}: {' '.join(str(error).split())[:80]}."
         ) from None
     x64, caching = precision() == "float64", programs_folder() is not None
-    versions = versions_of(made_with())
+    versions = deciding(made_with())
     with client:
         # Not ``client.get_executor()``: a future of it whose result is on its way when the
         # scheduler dies never ends.
@@ -76,21 +76,16 @@ def run_on_cluster(
                 # without the tracebacks of its attempts to connect again
                 logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
                 raise ConnectionError(f"the scheduler at {address} has gone") from None
-            _require_versions(versions, versions_of(of_worker))
+            if difference := first_difference(deciding(of_worker), versions):
+                name, other, required = difference
+                raise InputError(
+                    "workers must have the versions of this process, and one has "
+                    f"{name.removeprefix('version_')} {other!r}, not {required!r}."
+                )
             if made is not None:
                 for name, value in of_worker.items():
                     made.setdefault(name, {})[value] = None
             yield number, result
-
-
-def _require_versions(versions: Mapping[str, str], of_worker: Mapping[str, str]) -> None:
-    """Raise an InputError if a worker has other versions than this process."""
-    if difference := first_difference(of_worker, versions):
-        name, other, required = difference
-        raise InputError(
-            "workers must have the versions of this process, and one has "
-            f"{name.removeprefix('version_')} {other!r}, not {required!r}."
-        )
 
 
 def _on_worker(

@@ -82,8 +82,12 @@ def map_dataset(
         group: follow_conventions(xr.Dataset(variables, coordinates.get(group)))
         for group, variables in groups.items()
     }
-    ran = {} if "engine" in run else what_runs(settings)
-    tree["/"].attrs.update({**run_attributes(settings), **ran, **_history(run), **run})
+    about = run_attributes(settings)
+    if "engine" not in run:
+        engine = select_engine(settings.numerics)
+        about |= {"engine": engine.name, "solver": engine.solver_in_use(settings.solver)}
+    made = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} {run.get('command', 'jaxgran.ratio_map')}"
+    tree["/"].attrs.update({**about, "history": made, **run})  # in the form of CF
     return xr.DataTree.from_dict(tree)
 
 
@@ -166,14 +170,6 @@ def _coordinates(settings: MapSettings) -> dict[str, dict[str, xr.Variable]]:
     }
 
 
-def _history(run: Mapping[str, Any]) -> dict[str, str]:
-    """When and by what a map was made, in the form of CF; a command that continues a map is the
-    last one.
-    """
-    command = run.get("command", "jaxgran.ratio_map")
-    return {"history": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} {command}"}
-
-
 def run_attributes(settings: MapSettings) -> dict[str, Any]:
     """All parameters of the run, in types that NetCDF can store.
 
@@ -225,9 +221,3 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
         **({} if settings.part is None else {"part_points": points_of_part(settings)}),
         **made_with(),
     }
-
-
-def what_runs(settings: MapSettings) -> dict[str, str]:
-    """The attributes ``engine`` and ``solver``: what this process takes for the flows of a map."""
-    engine = select_engine(settings.numerics)
-    return {"engine": engine.name, "solver": engine.solver_in_use(settings.solver)}

@@ -40,17 +40,13 @@ def random_bits() -> str:
     return "threefry2x32" if partitionable else "threefry2x32, not partitionable"
 
 
-def versions_of(made: Mapping[str, str]) -> dict[str, str]:
-    """The versions and sources on which the numbers depend, of what ``made_with`` returns or a file
-    has.
+def deciding(made: Mapping[str, str]) -> dict[str, str]:
+    """The versions, sources and precision on which the numbers depend, of what ``made_with``
+    returns or a file has.
     """
     names = (*(f"version_{name}" for name in DECIDING), "code_digest", "random_bits")
-    return {name: made[name] for name in names if name in made}
-
-
-def deciding(made: Mapping[str, str]) -> dict[str, str]:
-    """The same and the precision."""
-    return versions_of(made) | {"precision": made.get("precision", "")}
+    known = {name: made[name] for name in names if name in made}
+    return known | {"precision": made.get("precision", "")}
 
 
 def code_name(made: Mapping[str, str]) -> str:

@@ -205,7 +205,10 @@ def _run_missing(
     """
     done: dict[ReplicaId, Replica] = {} if store is None else dict(store.replicas)
     if store is not None and run.resume:
-        _tell_resumed(settings, run, store)
+        count = counted(len(replica_ids(settings)), "replica")
+        run.tell(f"continued: {len(done)} of {count} done.")
+        if store.damaged:
+            run.tell(f"damaged and computed again: {', '.join(store.damaged)}.")
     missing = [x for x in replica_ids(settings) if x not in done]
     workers, start = min(len(missing) or 1, run.workers or 1), perf_counter()
     resumed, made, interruption = len(done), Provenance(), None
@@ -286,14 +289,6 @@ def _workers(run: RunOptions) -> int:
     if run.workers > 1 and not on_processor():
         raise refused("workers", run.workers, "must be 1 on an accelerator")
     return run.workers
-
-
-def _tell_resumed(settings: MapSettings, run: RunOptions, store: Store) -> None:
-    """Print how much of a map is done, and which files are damaged."""
-    count = counted(len(replica_ids(settings)), "replica")
-    run.tell(f"continued: {len(store.replicas)} of {count} done.")
-    if store.damaged:
-        run.tell(f"damaged and computed again: {', '.join(store.damaged)}.")
 
 
 def _warn_of_bad_points(data: xr.DataTree) -> None:

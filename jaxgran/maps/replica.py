@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 AXES = ("grains", "timestep", "packing_fraction", "restitution")
 """The axes of a map, outermost first."""
 
+FURTHER, PLANE = AXES[:2], AXES[2:]
+"""Those that are dimensions of the maps that have several of them, and of all maps."""
+
 
 class Point(NamedTuple):
     """A point of a map: the numbers that its replicas have in common."""

@@ -12,8 +12,9 @@ from pathlib import Path
 import xarray as xr
 
 from jaxgran.files import atomic_write, other_version
+from jaxgran.io.paths import as_path
 from jaxgran.maps.schema import FORMAT_VERSION, RATIO, what_lacks
-from jaxgran.model.checks import InputError, refused, short_repr
+from jaxgran.model.checks import InputError, short_repr
 
 _MARK = b"SHA-256:"  # between the dataset and its checksum
 _DIGEST = hashlib.sha256().digest_size  # bytes
@@ -41,12 +42,11 @@ def open_map(path: str | Path) -> xr.DataTree:
       InputError: (a ValueError) the file does not exist, cannot be read, is not a map, or has
         another version of the format.
     """
-    if not isinstance(path, (str, os.PathLike)):
-        raise refused("path", path, "must be a file name")
+    path = as_path("path", path)
     if not os.path.isfile(path):
         raise InputError(f"there is no file {short_repr(str(path))}.")
     try:
-        data = xr.load_datatree(_whole(Path(path)), engine="netcdf4")
+        data = xr.load_datatree(_whole(path), engine="netcdf4")
     except Exception as error:  # an incomplete file may fail in any way
         why = " ".join(str(error).split()).replace(": '<xarray-in-memory-read>'", "").rstrip(".")
         raise InputError(
@@ -69,22 +69,3 @@ def _whole(path: Path) -> bytes:
     if end.startswith(_MARK) and end.removeprefix(_MARK) != hashlib.sha256(content).digest():
         raise ValueError("it is damaged, and not what was written")
     return whole
-
-
-def differences(data: xr.DataTree) -> list[str]:
-    """Descriptions of the differences in versions, device and precision between a map and this
-    process.
-    """
-    from jaxgran.maps.provenance import made_with
-
-    process = made_with()
-    names = [
-        name
-        for name in process
-        if name.startswith("version_") or name in ("device", "precision", "commit", "code_digest")
-    ]
-    return [
-        f"{name.replace('_', ' ')} {data.attrs[name]} there, {process[name]} here"
-        for name in names
-        if name in data.attrs and data.attrs[name] != process[name]
-    ]

@@ -25,7 +25,7 @@ from jaxgran.maps.cluster import Provenance, run_on_cluster
 from jaxgran.maps.replica import Advance, Replica, ReplicaId
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
-from jaxgran.sampling.observe import AdvanceWrapper, ObserveBatch, advance_batch, reporting
+from jaxgran.sampling.observe import AdvanceBatch, AdvanceWrapper, advance_batch, reporting
 from jaxgran.sampling.sample_batch import sample_batch
 from jaxgran.sampling.steady_state import prepare_batch
 
@@ -100,7 +100,7 @@ def _run_batch(
     record: AdvanceWrapper | None = None,
 ) -> list[Replica]:
     """Prepare and sample the replicas of one batch; one that does not fit into memory is halved."""
-    advance: ObserveBatch = advance_batch
+    advance: AdvanceBatch = advance_batch
     if report is not None:
         advance = reporting(advance, lambda dt, steps: report(Advance(replicas, dt, steps)))
     try:
@@ -122,7 +122,7 @@ def _run_batch(
 def _measured(
     settings: MapSettings,
     replicas: Batch,
-    advance: ObserveBatch,
+    advance: AdvanceBatch,
     record: AdvanceWrapper | None = None,
 ) -> list[Replica]:
     """Prepare and sample the replicas of a batch."""

@@ -7,13 +7,12 @@ alone, or a selection that has been flattened.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
 import xarray as xr
 
-from jaxgran.model.checks import InputError
+from jaxgran.maps.replica import AXES, FURTHER, PLANE
 from jaxgran.sampling.budget import ERROR_SOURCES
 from jaxgran.sampling.observables import OBSERVABLES, TENSOR_AXES
 
@@ -26,21 +25,6 @@ RATIO = ("force_ratio", "force_ratio_stderr")
 
 SOURCES_AND_TOTAL = ("total", *ERROR_SOURCES)
 """Coordinate ``error_source`` of ``NAME_large_system_ci95``."""
-
-FINEST: dict[str, Callable[[list], float]] = {"grains": max, "timestep": min}
-"""Optional dimensions of a map, with the functions that pick the value of the smallest errors."""
-
-_AXES = ("packing_fraction", "restitution")
-
-
-def require_map(data: Any, *names: str) -> xr.Dataset:
-    """The data of a map, flattened; InputError if they are not a ratio map with the named
-    variables.
-    """
-    problem = what_lacks(data, *names)
-    if problem:
-        raise InputError(f"data must be a ratio map, and {problem}.")
-    return flattened(data)
 
 
 def flattened(data: MapData) -> xr.Dataset:
@@ -74,11 +58,11 @@ def what_lacks(data: Any, *names: str) -> str:
     if not isinstance(data, MapData):
         return f"this is a {type(data).__name__}"
     data = flattened(data)
-    missing = [name for name in (*_AXES, *names) if name not in data.variables]
+    missing = [name for name in (*PLANE, *names) if name not in data.variables]
     if missing:
         return f"it has no {', '.join(missing)}"
-    for name in (*_AXES, *FINEST):
-        if name in data.coords and name in (*_AXES, *data.dims):
+    for name in (*PLANE, *FURTHER):
+        if name in data.coords and name in (*PLANE, *data.dims):
             axis = data[name]
             numeric = axis.dtype.kind in "iuf" and axis.dims == (name,) and axis.size > 0
             if (
@@ -89,8 +73,8 @@ def what_lacks(data: Any, *names: str) -> str:
                 return f"its {name} is not a list of different numbers"
     for name in (*names, *(("status",) if "status" in data else ())):
         variable = data[name]
-        further = set(variable.dims) - {*_AXES, *FINEST}
-        on_axes = set(_AXES) <= set(variable.dims) and further in (
+        further = set(variable.dims) - {*AXES}
+        on_axes = set(PLANE) <= set(variable.dims) and further in (
             set(),
             {*TENSOR_AXES},
             {"error_source"},
@@ -107,28 +91,12 @@ def what_lacks(data: Any, *names: str) -> str:
     return ""
 
 
-def finest(data: MapData, *names: str) -> xr.Dataset:
-    """A map at its largest number of grains and its shortest time step, flattened; these become its
-    attributes.
-
-    If names of these dimensions are given, the others remain.
-    """
-    data = flattened(data)
-    for name in names or FINEST:
-        if name in data.dims:
-            values = data[name].values.tolist()
-            data = data.isel({name: values.index(FINEST[name](values))})
-        if name in data.coords:
-            data = data.assign_attrs({name: data[name].item()})
-    return data
-
-
 def parts(data: MapData) -> list[xr.Dataset]:
     """The parts of a map for each number of grains and time step, flattened; these become
     attributes of the part.
     """
     selected = [flattened(data)]
-    for name in FINEST:
+    for name in FURTHER:
         if name in selected[0].dims:
             values = selected[0][name].values.tolist()
             selected = [

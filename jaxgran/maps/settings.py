@@ -27,16 +27,13 @@ import numpy as np
 
 from jaxgran.maps.options import Command, Option, option
 from jaxgran.maps.presets import PRESETS
-from jaxgran.maps.replica import AXES, Point
+from jaxgran.maps.replica import AXES, FURTHER, PLANE, Point
 from jaxgran.model.choices import Activation, EngineName, SolverName
 
 if TYPE_CHECKING:
     from jaxgran.dynamics.engine import Numerics
     from jaxgran.model.flow import ShearFlow
     from jaxgran.model.grains import Grains
-
-PLANE = AXES[2:]
-"""The dimensions that all maps have."""
 
 _POSITIVE = (lambda x: (x > 0) & (x < math.inf), "a positive number")
 _ERROR = (lambda x: (x >= 1e-3) & (x <= 0.5), "between 1e-3 and 0.5")
@@ -163,7 +160,9 @@ class MapSettings:
         object.__setattr__(self, "solver", with_tolerance(self.solver, self.tolerance))
         object.__setattr__(self, "tolerance", None)
         for name in AXES:
-            object.__setattr__(self, name, _axis(getattr(self, name)))
+            values = getattr(self, name)
+            values = values if isinstance(values, tuple) else (values,)
+            object.__setattr__(self, name, tuple(map(rounded, values)))
         check_axes(self)
         self._sort_plane()
         check_settings(self)
@@ -193,12 +192,6 @@ class MapSettings:
     def dimensions(self) -> tuple[str, ...]:
         """The dimensions of a point in the data: the plane, and axes of two or more values."""
         return tuple(name for name, x in self.axes.items() if name in PLANE or len(x) > 1)
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """The numbers of grains, at least one."""
-        by_point = self.grains_by_point
-        return self.grains if by_point is None else tuple(sorted(set(by_point)))
 
     @property
     def seed_numbers(self) -> range:
@@ -273,11 +266,6 @@ def rounded(number: Any) -> Any:
     return float(f"{number:.{min(10, np.finfo(type(number)).precision)}g}")
 
 
-def _axis(values: Any) -> Any:
-    """The numbers of an axis, rounded; a tuple also of one."""
-    return tuple(map(rounded, values)) if isinstance(values, tuple) else (rounded(values),)
-
-
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """How a map is run and kept, checked: no number of it depends on this.
@@ -301,11 +289,7 @@ class RunOptions:
         example="FILE.nc",
     )
     output: Path | None = option(
-        None,
-        "NetCDF file of the results, with all parameters.",
-        Path,
-        short="o",
-        example="FILE.nc",
+        None, "NetCDF file of the results, with all parameters.", Path, short="o", example="FILE.nc"
     )
     overwrite: bool = option(False, "Replace existing files.", bool)
     resume: bool = option(
@@ -368,11 +352,6 @@ def options(command: Command) -> dict[str, Option]:
     return {name: row for name, row in OPTIONS.items() if command in row.commands}
 
 
-def is_new_dimension(name: str) -> bool:
-    """Whether a list of values adds a dimension to the plane of a map."""
-    return OPTIONS[name].several and DEFAULTS[name] is not None
-
-
 def table() -> str:
     """The parameters of ``ratio_map`` as lines of a docstring."""
     return "\n      ".join(map(_described, OPTIONS))
@@ -381,7 +360,7 @@ def table() -> str:
 def _described(name: str) -> str:
     about = OPTIONS[name]
     unit = f" In {about.unit}." if about.unit else ""
-    dimension = " Several add a dimension." if is_new_dimension(name) else ""
+    dimension = " Several add a dimension." if name in FURTHER else ""
     return (
         f"{name}: {about.help}{unit}{dimension} Default: {about.default or repr(DEFAULTS[name])}."
     )

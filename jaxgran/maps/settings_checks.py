@@ -7,11 +7,9 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -20,7 +18,7 @@ import numpy as np
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, require_solver
 from jaxgran.dynamics.batch import stack
 from jaxgran.dynamics.engine import Jax, Numba, checked_numerics, select_engine
-from jaxgran.io.paths import require_place
+from jaxgran.io.paths import as_path, require_place
 from jaxgran.model.checks import (
     InputError,
     refused,
@@ -116,12 +114,13 @@ def _check_diameters(settings: MapSettings, flows: Sequence[ShearFlow]) -> None:
     if settings.polydispersity != defaults["polydispersity"]:
         reason = "must be left out where `diameters` are given"
         raise refused("polydispersity", settings.polydispersity, reason)
-    if any(size % len(settings.diameters) for size in settings.sizes):
-        sizes = ", ".join(map(str, settings.sizes))
-        reason = f"must be a list whose length divides the number of grains, {sizes}"
+    sizes = dict.fromkeys(settings.grains_by_point or settings.grains)
+    if any(size % len(settings.diameters) for size in sizes):
+        words = ", ".join(map(str, sizes))
+        reason = f"must be a list whose length divides the number of grains, {words}"
         raise refused("diameters", list(settings.diameters), reason)
     densest = max(flows, key=lambda flow: float(flow.packing_fraction))
-    for size in settings.sizes:
+    for size in sizes:
         discs = own_grains(np.resize(settings.diameters, size))
         require_room(replace(densest, grains=size), discs)
 
@@ -216,9 +215,7 @@ def check_run(run: RunOptions) -> None:
         if run.resume:
             raise InputError("`resume` requires `output`.", field="resume")
         return
-    if not isinstance(run.output, (str, os.PathLike)):
-        raise refused("output", run.output, "must be a file name")
-    require_place(Path(run.output), "output", ".nc")
+    require_place(as_path("output", run.output), "output", ".nc")
 
 
 def are_numbers(values: Sequence[Any]) -> bool:

@@ -8,9 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from jaxgran.io.paths import as_path
 from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.presets import PRESETS
-from jaxgran.maps.results import differences, open_map
+from jaxgran.maps.provenance import made_with
+from jaxgran.maps.results import open_map
 from jaxgran.model.checks import InputError, refused
 
 _REPLACED = {
@@ -22,6 +24,7 @@ _REPLACED = {
 _OF_POINTS = {"grains", "timestep", "restitution", "packing_fraction", "error"}
 _OF_ERROR = {"grains": "auto", "timestep": "auto", "seeds": 1}
 """What an error implies; a longer sample is cheaper than a second seed."""
+_COMPARED = ("device", "precision", "commit", "code_digest")  # of two runs, and the versions
 
 
 def with_start(
@@ -40,9 +43,7 @@ def with_start(
         return combined(PRESETS[name], given)
     if preset is not None:
         raise InputError("`preset` and `from_map` exclude each other.", field="preset")
-    if not isinstance(from_map, (str, os.PathLike)):
-        raise refused("from_map", from_map, "must be a file name")
-    return combined(_parameters_of(Path(from_map)), given)
+    return combined(_parameters_of(as_path("from_map", from_map)), given)
 
 
 def combined(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -62,9 +63,14 @@ def _parameters_of(file: Path) -> dict[str, Any]:
     """The parameters of the map in a file; a warning names other differences that could change its
     numbers.
     """
-    data = open_map(file)
-    settings, different = from_attrs(data), differences(data)
-    if different:
+    data, process = open_map(file), made_with()
+    settings = from_attrs(data)
+    compared = (x for x in process if x.startswith("version_") or x in _COMPARED)
+    if different := [
+        f"{name.replace('_', ' ')} {data.attrs[name]} there, {process[name]} here"
+        for name in compared
+        if data.attrs.get(name, process[name]) != process[name]
+    ]:
         warnings.warn(f"differs from {file}: {'; '.join(different)}.", stacklevel=4)
     # the tolerance holds for another solver too
     return settings | {"tolerance": getattr(settings["solver"], "tolerance", None)}

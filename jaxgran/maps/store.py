@@ -35,13 +35,7 @@ from jaxgran.environment import default_device, precision
 from jaxgran.files import atomic_write, is_locked, lock_file
 from jaxgran.io.arrays import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps import results
-from jaxgran.maps.attributes import (
-    common_identity,
-    digest,
-    first_difference,
-    from_attrs,
-    identity,
-)
+from jaxgran.maps.attributes import common_identity, digest, first_difference, from_attrs, identity
 from jaxgran.maps.batches import replica_ids
 from jaxgran.maps.own_observables import sums_by_name
 from jaxgran.maps.provenance import code_name, deciding, made_with
@@ -73,7 +67,8 @@ class Store:
     """
 
     def __init__(self, output: Path, settings: MapSettings, resume: bool, overwrite: bool):
-        self.output, self.settings, self.folder = output, settings, unfinished_folder(output)
+        self.output, self.settings = output, settings
+        self.folder = output.with_name(f"{output.name}.unfinished")
         self.damaged: list[str] = []
         self._lock_path, self._begun_path = self.folder / "lock", self.folder / "settings.json"
         self._ids = set(replica_ids(settings))
@@ -307,11 +302,6 @@ def open_store(
         raise
     finally:
         store.close(written)
-
-
-def unfinished_folder(output: Path) -> Path:
-    """The folder beside the output of a map that is not finished."""
-    return output.with_name(f"{output.name}.unfinished")
 
 
 def _text(replica: ReplicaId) -> str:

@@ -8,6 +8,7 @@ from typing import Any, get_args
 import numpy as np
 import xarray as xr
 
+from jaxgran.maps.replica import AXES
 from jaxgran.maps.schema import MapData
 from jaxgran.model.choices import Activation
 from jaxgran.model.display import counted
@@ -16,7 +17,7 @@ from jaxgran.page.grain_data import ENCODING, MOST_GRAINS, grain_data
 from jaxgran.page.observables import COLUMNS, column, numbers, observables_of, text_line
 from jaxgran.page.reference_map import verdicts
 from jaxgran.plotting.plane import EXCESS_LEVELS
-from jaxgran.plotting.selection import DIMENSIONS, points, status_names
+from jaxgran.plotting.selection import points, status_names
 
 MOST_POINTS = 2500
 """Points of a page; of a larger map a part is shown."""
@@ -56,7 +57,7 @@ def map_data(data: MapData) -> dict[str, Any]:
     texts = {x: [plain(y) for y in shown[x].values] for x in _PARAMETERS if x in shown.coords}
     forms = [_PARAMETERS[name][1] for name in flows]
     statuses = status_names(shown).ravel().tolist()
-    fewer = [name for name in DIMENSIONS if shown.sizes[name] < whole.sizes[name]]
+    fewer = [name for name in AXES if shown.sizes[name] < whole.sizes[name]]
     parts = (f"{shown.sizes[x]} of {whole.sizes[x]} values of {x.replace('_', ' ')}" for x in fewer)
     lists = {name: (label, texts.get(name, ["–"])) for name, (label, _) in _PARAMETERS.items()}
     lists = {"observable": ("Observable", [x["label"] for x in observables]), **lists}
@@ -91,7 +92,7 @@ def map_data(data: MapData) -> dict[str, Any]:
 def _thinned(data: xr.Dataset) -> xr.Dataset:
     """At most ``MOST_POINTS`` points: every other value of the longest axis, until there are."""
     while data.force_ratio.size > MOST_POINTS:
-        longest = max(DIMENSIONS, key=lambda name: data.sizes[name])
+        longest = max(AXES, key=lambda name: data.sizes[name])
         data = data.isel({longest: slice(None, None, 2)})
     return data
 
@@ -114,7 +115,7 @@ def _instants(data: xr.Dataset, flows: dict[str, np.ndarray]) -> list[dict[str, 
     known = {*paths.values()} <= {*data} and "timestep" in flows
     if activation not in get_args(Activation) or not known:
         return None
-    states = data[list(paths.values())].stack(point=DIMENSIONS)
+    states = data[list(paths.values())].stack(point=AXES)
 
     def instant(k: int) -> dict[str, Any] | None:
         values = states.isel(point=k)

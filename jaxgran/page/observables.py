@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from jaxgran.maps.replica import AXES
 from jaxgran.maps.schema import TENSOR_AXES, path_of
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import with_error
-from jaxgran.plotting.selection import DIMENSIONS
 from jaxgran.sampling.observables import unit_text
 
 COLUMNS = ("observable", "value ± error", "theory", "samples", "large system ± 95 %")
@@ -39,13 +39,13 @@ def observables_of(data: xr.Dataset) -> Iterator[dict[str, Any]]:
 def _is_shown(data: xr.Dataset, name: str) -> bool:
     """Whether a variable is a number at every point, and not part of another one."""
     variable = data[name]
-    dims = set(variable.dims) | set(DIMENSIONS)
+    dims = set(variable.dims) | set(AXES)
     belongs = any(name.endswith(end) and name.removesuffix(end) in data for end in _COMPANIONS)
     belongs |= name.startswith("theory/") and path_of(name.removeprefix("theory/")) in data
     apart = name in ("status", "point_grains") or name.startswith("states/")
     return (
         variable.dtype.kind in "iuf"
-        and dims in ({*DIMENSIONS}, {*DIMENSIONS, *TENSOR_AXES})
+        and dims in ({*AXES}, {*AXES, *TENSOR_AXES})
         and not (belongs or apart or "flag_values" in variable.attrs)
     )
 
@@ -96,7 +96,7 @@ def column(variable: xr.DataArray, data: xr.Dataset) -> np.ndarray:
     """The values of a variable, or the total of an interval, by point, in order of dimensions."""
     if "error_source" in variable.dims:
         variable = variable.sel(error_source="total")
-    by_point = variable.broadcast_like(data.force_ratio).transpose(*DIMENSIONS)
+    by_point = variable.broadcast_like(data.force_ratio).transpose(*AXES)
     return by_point.values.astype(float).ravel()
 
 

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from jaxgran.maps.replica import PLANE
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.reference.table import LENGTH, shipped_table
 from jaxgran.reference.validity import COLUMNS, validity
 from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.theory.assumptions import ASSUMPTIONS
 
-_PLANE = ("packing_fraction", "restitution")
 _PATHS = {f"pressure_{name}": f"theory/enskog_factor_pressure_{name}" for name in ASSUMPTIONS} | {
     LENGTH: f"theory/{LENGTH}"
 }
@@ -24,14 +24,14 @@ def reference_dataset() -> xr.Dataset:
     kinetic theory.
     """
     table = shipped_table()
-    flows = [table.columns[name] for name in _PLANE]
+    flows = [table.columns[name] for name in PLANE]
     axes, places = zip(*(np.unique(x, return_inverse=True) for x in flows), strict=True)
     variables: dict[str, tuple] = {}
 
     def put(name: str, values: np.ndarray, **attributes: str) -> None:
         grid = np.full([len(axis) for axis in axes], np.nan)
         grid[places] = values
-        variables[name] = _PLANE, grid, attributes
+        variables[name] = PLANE, grid, attributes
 
     for name in table.surfaces:
         path, stderr = _PATHS.get(name, name), table.columns[f"{name}_stderr"]
@@ -56,7 +56,7 @@ def reference_dataset() -> xr.Dataset:
         put(f"{name}_error_of_theory_ci95", error.ci95)
     timestep = float(table.head["timestep"])
     attributes = {"title": f"The reference map of jaxgran: {table.made_with}", "timestep": timestep}
-    return xr.Dataset(variables, dict(zip(_PLANE, axes, strict=True)), attributes)
+    return xr.Dataset(variables, dict(zip(PLANE, axes, strict=True)), attributes)
 
 
 def verdicts(packing_fractions: np.ndarray, restitutions: np.ndarray) -> dict[str, Any]:

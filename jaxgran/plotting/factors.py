@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxgran.maps.schema import RATIO, MapData, what_lacks
+from jaxgran.maps.schema import MapData
 from jaxgran.model.display import counted
 from jaxgran.plotting.selection import describe, plane, suspect
 from jaxgran.plotting.style import (
@@ -45,18 +45,15 @@ CURVES = {"temperature": ("temperature", "#2a8c4a", "P")} | FACTORS
 """The same after the factor of the temperature, over the contact pressure of the whole theory."""
 
 _PRODUCT = ("measured/theory", "black", "")
-_NEEDED = (
+NEEDED = (
     *(f"{PREFIX}{name}{end}" for name in FACTORS for end in ("", "_stderr")),
     *("granular_temperature", "stresses/kinetic_stress", "theory/granular_temperature"),
     *("theory/pressure", "theory/enskog_pressure", "theory/enskog_pressure_stderr"),
 )
+"""Variables of a map that :func:`enskog_factors` needs beside the ratio."""
+
 _MOST_PANELS = 3
 _LABEL_HEIGHT = 0.07  # in heights of the panel
-
-
-def has_factors(data: xr.Dataset) -> bool:
-    """Return whether a map has the variables and the range that :func:`enskog_factors` draws."""
-    return data.sizes["packing_fraction"] >= 2 and not what_lacks(data, *RATIO, *_NEEDED)
 
 
 def with_temperature(data: xr.Dataset) -> xr.Dataset:
@@ -85,7 +82,7 @@ def enskog_factors(data: MapData) -> Figure:
         temperatures and pressures of flow and theory, and `status`. The largest of several numbers
         of grains and the shortest of several time steps are drawn.
     """
-    data = with_temperature(plane(data, *_NEEDED))
+    data = with_temperature(plane(data, *NEEDED))
     count = data.sizes["restitution"]
     chosen = np.unique(np.round((count - 1) * np.linspace(0.9, 0.1, _MOST_PANELS)).astype(int))
     shown = data.isel(restitution=chosen[::-1])

@@ -89,10 +89,6 @@ def common_scale(networks: Iterable[ForceNetwork]) -> Scale:
     )
 
 
-# ----------------------------------------------------------------------------------------------
-# drawing
-
-
 def draw_flow(axes: Axes, network: ForceNetwork, scale: Scale) -> EllipseCollection:
     """Draw a flow in a square window, in place of what is drawn there: its grains, which are
     returned, and the forces in clusters and of binary collisions.

@@ -10,34 +10,41 @@ from typing import Any, NamedTuple, get_args
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxgran.maps.schema import RATIO, MapData
+from jaxgran.maps.replica import PLANE
+from jaxgran.maps.schema import RATIO, MapData, what_lacks
 from jaxgran.model.checks import InputError, refused, require_flag, require_whole
 from jaxgran.model.choices import FileFormat
 from jaxgran.plotting.against import averages_against_grains, ratio_against_timestep
-from jaxgran.plotting.factors import enskog_factors, has_factors
+from jaxgran.plotting.factors import NEEDED, enskog_factors
 from jaxgran.plotting.ratio import ratio_contours, ratio_curves
-from jaxgran.plotting.selection import is_plane, points
+from jaxgran.plotting.selection import points
 from jaxgran.plotting.style import FILE_DPI, write
-from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
+from jaxgran.plotting.theory import CLUSTERS, THEORY, cluster_shares, theory_errors
 
 _LONGEST_NAME = 200  # bytes of a stem; file systems accept 255, with the rest of the name
 
 
 class MapFigure(NamedTuple):
-    """A figure of a map, and whether a map has the data for it."""
+    """A figure of a map, the axes that need two values for it, and further variables."""
 
     draw: Callable[[MapData], Figure]
-    is_possible: Callable[[xr.Dataset], bool]
+    several: tuple[str, ...] = ()
+    needed: tuple[str, ...] = ()
+
+    def is_possible(self, data: xr.Dataset) -> bool:
+        """Whether a map has the data for it."""
+        several = all(data.sizes[name] >= 2 for name in self.several)
+        return several and not what_lacks(data, *RATIO, *self.needed)
 
 
 FIGURES = {
-    "curves": MapFigure(ratio_curves, lambda data: True),
-    "contours": MapFigure(ratio_contours, is_plane),
-    "timestep": MapFigure(ratio_against_timestep, lambda data: data.sizes["timestep"] >= 2),
-    "size": MapFigure(averages_against_grains, lambda data: data.sizes["grains"] >= 2),
-    "theory": MapFigure(theory_errors, has_theory),
-    "factors": MapFigure(enskog_factors, has_factors),
-    "clusters": MapFigure(cluster_shares, has_clusters),
+    "curves": MapFigure(ratio_curves),
+    "contours": MapFigure(ratio_contours, PLANE),
+    "timestep": MapFigure(ratio_against_timestep, ("timestep",)),
+    "size": MapFigure(averages_against_grains, ("grains",)),
+    "theory": MapFigure(theory_errors, PLANE, THEORY),
+    "factors": MapFigure(enskog_factors, ("packing_fraction",), NEEDED),
+    "clusters": MapFigure(cluster_shares, needed=CLUSTERS),
 }
 """All figures of a map by the ending of their files, in the order in which they are drawn."""
 

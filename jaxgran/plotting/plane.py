@@ -22,14 +22,7 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
 
 from jaxgran.plotting.selection import suspect
-from jaxgran.plotting.style import (
-    ALPHA_LABEL,
-    INTERVAL_COLOUR,
-    NU_LABEL,
-    RING,
-    SMALL_SIZE,
-    padded,
-)
+from jaxgran.plotting.style import ALPHA_LABEL, INTERVAL_COLOUR, NU_LABEL, RING, SMALL_SIZE, padded
 
 EXCESS_LEVELS = (0.05, 0.10, 0.25, 0.50, 1.00)
 """Contour values of the excess of the force ratio over one, as in Figure 2."""
@@ -71,10 +64,6 @@ def refined(values: np.ndarray) -> np.ma.MaskedArray:
         fine = np.arange((count - 1) * _SUBDIVISIONS + 1) / _SUBDIVISIONS
         values = np.apply_along_axis(partial(np.interp, fine, np.arange(count)), axis, values)
     return np.ma.masked_invalid(values)
-
-
-# ----------------------------------------------------------------------------------------------
-# contours
 
 
 def draw_plane(
@@ -163,10 +152,6 @@ def add_plane_legend(figure: Figure, legend: Legend) -> None:
             handlelength=1.4,
             columnspacing=1.5,
         )
-
-
-# ----------------------------------------------------------------------------------------------
-# labels
 
 
 def _label(axes: Axes, drawn: QuadContourSet, texts: list[str], rings: np.ndarray) -> None:

@@ -14,12 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from jaxgran.maps.schema import MapData, shear_stress_ratio
-from jaxgran.plotting.plane import (
-    EXCESS_LEVELS,
-    add_plane_legend,
-    contour_variable,
-    draw_plane,
-)
+from jaxgran.plotting.plane import EXCESS_LEVELS, add_plane_legend, contour_variable, draw_plane
 from jaxgran.plotting.selection import describe, plane, require_plane, suspect
 from jaxgran.plotting.style import (
     ALPHA_TITLE,

@@ -8,32 +8,28 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxgran.maps.schema import RATIO, MapData, flag_names, flattened, require_map
+from jaxgran.maps.replica import AXES, PLANE
+from jaxgran.maps.schema import RATIO, MapData, flag_names, flattened, what_lacks
 from jaxgran.model.checks import InputError
 from jaxgran.model.display import counted
 from jaxgran.plotting.style import add_caption, scientific
 
-DIMENSIONS = ("grains", "timestep", "packing_fraction", "restitution")
 
-
-def expand_dims(data: MapData) -> xr.Dataset:
-    """Return a map, flattened, with all ``DIMENSIONS``.
+def points(data: MapData, *names: str) -> xr.Dataset:
+    """Return a map, flattened, in the order of ``AXES``, each of which increases.
 
     A scalar coordinate becomes a dimension of one value. A dimension that the map does not tell has
     the size one and no coordinate.
-    """
-    flat = flattened(data)
-    return flat.expand_dims([name for name in DIMENSIONS if name not in flat.dims])
-
-
-def points(data: MapData, *names: str) -> xr.Dataset:
-    """Return a map in the order of ``DIMENSIONS``, each of which increases.
 
     Raises:
       InputError: (a ValueError) the data are not a map, or the map lacks one of the variables.
     """
-    data = require_map(expand_dims(data) if isinstance(data, MapData) else data, *names)
-    return data.sortby(list(DIMENSIONS)).transpose(*DIMENSIONS, ...)
+    if isinstance(data, MapData):
+        data = flattened(data)
+        data = data.expand_dims([name for name in AXES if name not in data.dims])
+    if problem := what_lacks(data, *names):
+        raise InputError(f"data must be a ratio map, and {problem}.")
+    return data.sortby(list(AXES)).transpose(*AXES, ...)
 
 
 def plane(data: MapData, *names: str) -> xr.Dataset:
@@ -43,14 +39,9 @@ def plane(data: MapData, *names: str) -> xr.Dataset:
     return points(data, *RATIO, *names).isel(grains=-1, timestep=0)
 
 
-def is_plane(data: xr.Dataset) -> bool:
-    """Return whether a map has at least two restitutions and two packing fractions."""
-    return min(data.sizes["restitution"], data.sizes["packing_fraction"]) >= 2
-
-
 def require_plane(data: xr.Dataset) -> None:
-    """Raise an InputError if a map is not a plane."""
-    if not is_plane(data):
+    """Raise an InputError unless a map has at least two restitutions and packing fractions."""
+    if min(data.sizes[name] for name in PLANE) < 2:
         raise InputError(
             "contours need at least two restitutions and two packing fractions, "
             f"and this map has {data.sizes['restitution']} and {data.sizes['packing_fraction']}."

@@ -91,10 +91,6 @@ _MARKERS = "os^DvP<X>ph*"
 _LINE_STYLES = ("-", (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)), (0, (2, 1)), (0, (1, 1)))
 
 
-# ----------------------------------------------------------------------------------------------
-# figures and files
-
-
 class StyledFigure(Figure):
     """A figure that is drawn in ``STYLE`` wherever it is shown, also as the last line of a cell."""
 
@@ -149,10 +145,6 @@ def write(figure: Figure, path: Path, dpi: int = FILE_DPI, caption: bool = True)
     return path
 
 
-# ----------------------------------------------------------------------------------------------
-# curves
-
-
 def curve_styles(count: int) -> list[dict[str, Any]]:
     """Return a colour, marker and line style for each curve; they differ also in a grey print."""
     ramp = colormaps["viridis"](np.linspace(0.0, 0.82, count))
@@ -192,10 +184,6 @@ def add_curve_legend(figure: Figure, labels: Sequence[str], title: str, bad: Any
     columns = 1 + (len(handles) - 1) // 16
     place = {"loc": "outside right upper", "ncols": columns, "handlelength": 3.2}
     figure.legend(handles=handles, title=title, **place)
-
-
-# ----------------------------------------------------------------------------------------------
-# axes and numbers
 
 
 def label_log_axis(axis: Axis) -> None:

@@ -11,7 +11,7 @@ import xarray as xr
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from jaxgran.maps.schema import RATIO, MapData, what_lacks
+from jaxgran.maps.schema import MapData
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import counted
 from jaxgran.plotting.plane import (
@@ -21,7 +21,7 @@ from jaxgran.plotting.plane import (
     draw_binary_limit,
     draw_plane,
 )
-from jaxgran.plotting.selection import describe, is_plane, plane, require_plane, suspect
+from jaxgran.plotting.selection import describe, plane, require_plane, suspect
 from jaxgran.plotting.style import (
     ALPHA_TITLE,
     TWO_COLUMNS,
@@ -40,29 +40,17 @@ ERROR_LEVELS: dict[str, float] = dict(
 """Contour values of the logarithm of a quotient, by their labels."""
 
 _QUANTITIES = {"pressure": "pressure", "shear_stress": "shear stress"}
-_THEORY = (
+THEORY = (
     *(*_QUANTITIES, "stress_ratio"),
     *(f"{name}_large_system{end}" for name in _QUANTITIES for end in ("", "_ci95")),
     *(f"theory/{name}" for name in _QUANTITIES),
     *("stresses/kinetic_stress", "stresses/binary_stress", "stress_ratio_stderr"),
 )
+"""Variables of a map that :func:`theory_errors` needs beside the ratio."""
+
 _SHARE = "stresses/cluster_pressure_share"
 CLUSTERS = (_SHARE, f"{_SHARE}_stderr")
 _LEAST_EXCESS = 1e-5  # smallest excess that its logarithmic axis shows
-
-
-def has_theory(data: xr.Dataset) -> bool:
-    """Return whether a map has the variables and the plane that :func:`theory_errors` draws."""
-    return is_plane(data) and not what_lacks(data, *RATIO, *_THEORY)
-
-
-def has_clusters(data: xr.Dataset) -> bool:
-    """Return whether a map has the variables that :func:`cluster_shares` draws."""
-    return not what_lacks(data, *RATIO, *CLUSTERS)
-
-
-# ----------------------------------------------------------------------------------------------
-# theory
 
 
 def error_parts(data: xr.Dataset, quantity: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -118,7 +106,7 @@ def theory_errors(data: MapData) -> Figure:
     Raises:
       InputError: (a ValueError) fewer than two restitutions or two packing fractions.
     """
-    data = plane(data, *_THEORY)
+    data = plane(data, *THEORY)
     require_plane(data)
     figure = empty_figure(TWO_COLUMNS, height=5.4)
     grid = figure.subplots(2, 2, sharex=True, sharey=True)
@@ -148,10 +136,6 @@ def theory_errors(data: MapData) -> Figure:
         "standard error of sampling",
     )
     return figure
-
-
-# --------------------------------------------------------------------------------------------
-# clusters
 
 
 @styled

@@ -69,9 +69,7 @@ def over_range(
     (low, high), (loosest, densest) = ranges
     inside = (low <= alpha) & (alpha <= high) & (loosest <= nu) & (nu <= densest)
     where = coordinates(
-        xp.where(inside, alpha, (low + high) / 2),
-        xp.where(inside, nu, (loosest + densest) / 2),
-        xp,
+        xp.where(inside, alpha, (low + high) / 2), xp.where(inside, nu, (loosest + densest) / 2), xp
     )
     # one by one: ranks are promoted nowhere
     estimates = jax.vmap(lambda point: evaluate(point, xp))(where.reshape(-1, 2))

@@ -17,14 +17,7 @@ from jaxgran.io.paths import require_absent
 from jaxgran.model.checks import as_array, require
 from jaxgran.model.display import WithError, text_of
 from jaxgran.reference.evaluation import PLANE, Estimate, from_log, module_of, over_range
-from jaxgran.reference.table import (
-    LENGTH,
-    MEASURED,
-    Table,
-    shipped_table,
-    theory_of,
-    write_columns,
-)
+from jaxgran.reference.table import LENGTH, MEASURED, Table, shipped_table, theory_of, write_columns
 
 _UNITS = MEASURED | {LENGTH: "sigma"}
 _POWERS = dict.fromkeys(MEASURED, 2) | {"dissipation_rate": 3, LENGTH: 0}  # of the shear rate

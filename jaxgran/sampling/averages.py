@@ -30,7 +30,9 @@ def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) 
       is −Σ^{xy}, as in the paper. An average over no contacts is NaN.
     """
     tally, area, shear_rate = in_numpy((tally, area, shear_rate))
-    xp = _namespace(*vars(tally).values(), area, shear_rate)
+    numbers = (*vars(tally).values(), area, shear_rate)
+    # NumPy is 100 times faster for the few numbers of a point
+    xp: Any = jnp if any(isinstance(x, jax.Array) for x in numbers) else np
     sums = Sums(tally, xp.asarray(area), grains, xp.asarray(shear_rate), xp)
     with np.errstate(divide="ignore", invalid="ignore"):  # NumPy warns of these, JAX does not
         return {name: getattr(sums, name) for name in OBSERVABLES}
@@ -79,10 +81,3 @@ class Sums:
         """The quotient; NaN without a warning where the denominator is zero."""
         zero = denominator == 0
         return self.xp.where(zero, self.xp.nan, numerator / self.xp.where(zero, 1, denominator))
-
-
-def _namespace(*values: Any) -> Any:
-    """``jax.numpy`` for JAX arrays, or else NumPy, which is 100 times faster for the few numbers of
-    a point.
-    """
-    return jnp if any(isinstance(x, jax.Array) for x in values) else np

@@ -80,11 +80,7 @@ def shear_by_block(
 ) -> tuple[Batch, Sample]:
     """Shear every replica by its own strain; the sample of this strain."""
     state, tallies = advance_by_block(
-        advance,
-        (batch.flow, batch.numerics, batch.state),
-        strain,
-        blocks,
-        batch.status >= GIVEN_UP,
+        advance, (batch.flow, batch.numerics, batch.state), strain, blocks, batch.status >= GIVEN_UP
     )
     sample = sample_of_blocks(batch.flow, state, tallies)
     worst = sample.tally.status.max(axis=1)

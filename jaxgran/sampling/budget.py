@@ -72,7 +72,20 @@ class SizeLaw(NamedTuple):
     def error(
         self, restitution: ArrayLike, packing_fraction: ArrayLike, grains: ArrayLike
     ) -> np.ndarray:
-        """``size_error`` by this law."""
+        """Half-width of the 95 % interval of an average that is corrected for its N, over the
+        average.
+
+        The first term is that of long waves of velocity. It grows with dissipation and vanishes in
+        dense flows. The second is that of jamming: the packing fraction at which a small system
+        jams scatters.
+
+        Examples:
+          The default number of grains, in a loose and in a dense flow:
+
+          >>> law = SIZE_LAWS["pressure"]
+          >>> [round(float(law.error(0.5, nu, 256)), 3) for nu in (0.6, 0.8)]
+          [0.086, 0.061]
+        """
         missing = self.missing(restitution, packing_fraction, grains)
         waves = self.spread * missing / (1 - missing)
         return np.hypot(waves, jamming_error(packing_fraction, grains))
@@ -113,29 +126,8 @@ class Estimate(NamedTuple):
         return np.sqrt(sum(part**2 for part in self.sources.values()))
 
 
-def size_error(
-    restitution: ArrayLike,
-    packing_fraction: ArrayLike,
-    grains: ArrayLike,
-    average: str = "pressure",
-) -> np.ndarray:
-    """Half-width of the 95 % interval of an average that is corrected for its N, over the average.
-
-    The first term is that of long waves of velocity. It grows with dissipation and vanishes in
-    dense flows. The second is that of jamming: the packing fraction at which a small system jams
-    scatters.
-
-    Examples:
-      The default number of grains, in a loose and in a dense flow:
-
-      >>> [round(float(size_error(0.5, nu, 256)), 3) for nu in (0.6, 0.8)]
-      [0.086, 0.061]
-    """
-    return SIZE_LAWS[average].error(restitution, packing_fraction, grains)
-
-
 def jamming_error(packing_fraction: ArrayLike, grains: ArrayLike) -> np.ndarray:
-    """The second term of ``size_error``."""
+    """The second term of ``SizeLaw.error``."""
     return 0.007 / distance_to_jamming(packing_fraction) * (100 / np.asarray(grains, float)) ** 1.25
 
 
@@ -157,7 +149,7 @@ def sampling_target(
       tolerance: relative residual of a contact solve.
     """
     flow = restitution, packing_fraction, grains
-    size = np.maximum(size_error(*flow), size_error(*flow, "shear_stress"))
+    size = np.maximum(SIZE_LAWS["pressure"].error(*flow), SIZE_LAWS["shear_stress"].error(*flow))
     others = size**2 + stress_error(crossing, packing_fraction, grains) ** 2
     left = error**2 - others - (RESIDUAL_FACTOR * tolerance) ** 2
     return np.sign(left) * np.sqrt(np.abs(left)) / HALF_INTERVAL
@@ -192,21 +184,21 @@ def large_system(
         in_contacts = (contact[..., 0, 0] + contact[..., 1, 1]) / 2 / np.asarray(values["pressure"])
     solve = RESIDUAL_FACTOR * np.asarray(tolerance) * in_contacts
     present = {name: 1 - law.missing(*flow) for name, law in SIZE_LAWS.items()}
-    estimates = {}
+    of_pressure, estimates = SIZE_LAWS["pressure"].error(*flow), {}
     for name in LARGE_SYSTEM:
         value, stderr = np.asarray(values[name], float), np.asarray(errors[name], float)
         if name == "force_ratio":
             factor = 1 / present["pressure"]
             large = 1 + factor * (value - 1)
-            size = _OF_EXCESS * size_error(*flow) * (np.abs(large - 1) + _UNSEEN_EXCESS)
+            size = _OF_EXCESS * of_pressure * (np.abs(large - 1) + _UNSEEN_EXCESS)
         elif name == "macroscopic_friction":
             factor = present["pressure"] / present["shear_stress"]
             large = factor * value
-            size = _FRICTION_SHARE * size_error(*flow) * np.abs(large)
+            size = _FRICTION_SHARE * of_pressure * np.abs(large)
         else:
             factor = 1 / present[name]
             large = factor * value
-            size = size_error(*flow, name) * np.abs(large)
+            size = SIZE_LAWS[name].error(*flow) * np.abs(large)
         scale = np.abs(large)
         sources = {
             "sampling": HALF_INTERVAL * factor * stderr,

@@ -58,21 +58,16 @@ from jaxgran.statistics import Estimates, standard_errors
 from jaxgran.theory.enskog import Collisions, collisional_transfer, enskog_collisions
 from jaxgran.theory.mixture import mixture_of
 
-RATES = {
-    "pressure": "contact pressure",
-    "shear_stress": "contact shear stress",
-    "dissipation_rate": "dissipation rate",
+RATES = {  # the stress that weights the speed of approach, and the power of this speed
+    "pressure": ("pressure", 2),
+    "shear_stress": ("shear_stress", 2),
+    "dissipation_rate": ("pressure", 3),
 }
 LENGTHS = {
     "correlation_length": "Enskog's dissipation rate over the measured one, at the local "
     "temperature",
     "correlation_length_from_pressure": "the same quotient of the dissipation rates over the "
     "contact pressures",
-}
-_SPEEDS = {
-    "pressure": ("pressure", 2),
-    "shear_stress": ("shear_stress", 2),
-    "dissipation_rate": ("pressure", 3),
 }
 _TOGETHER = 256  # tensors of one call: one compiled program serves samples of any number of blocks
 
@@ -121,7 +116,7 @@ def _factors(
             _enskog(flow, grains, tensor) for tensor in temperatures
         )
         factors = {}
-        for name, (weight, power) in _SPEEDS.items():
+        for name, (weight, power) in RATES.items():
             speed = speeds[weight] / binary[weight] * chaotic[weight] / chaotic_speeds[weight]
             of_rate = {
                 "local_temperature": isotropic[name] / enskog[name],

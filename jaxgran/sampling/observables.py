@@ -58,19 +58,6 @@ class Observable:
         """The names of the dimensions of a tensor; none for a scalar."""
         return TENSOR_AXES if self.tensor else ()
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """The shape of one value."""
-        return (2, 2) if self.tensor else ()
-
-    @property
-    def meaning_of_error(self) -> str:
-        """What ``NAME_stderr`` is."""
-        return (
-            f"{'standard deviation over blocks' if self.extreme else 'standard error'} of "
-            f"{self.meaning}"
-        )
-
 
 class Observables:
     """Every observable as an attribute, from the mapping ``averages``: this is the table of all

@@ -5,7 +5,7 @@ digest.
 import hashlib
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,25 +25,10 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 
-# Advances each replica of a batch by its number of steps, (replicas,), and a wrapper that adds
-# reports or records and leaves the states alone.
-AdvanceBatch = Callable[[ShearFlow, Numerics, State, Array | np.ndarray], tuple[State, Tally]]
+# ``advance_batch`` or what does the same, and a wrapper that adds reports or records and leaves the
+# states alone.
+AdvanceBatch = Callable[..., tuple[State, Tally]]
 AdvanceWrapper = Callable[[AdvanceBatch], AdvanceBatch]
-# Called with time step and number of steps of each replica.
-Report = Callable[[ArrayLike, ArrayLike], None]
-
-
-class ObserveBatch(Protocol):
-    """An ``AdvanceBatch`` that can observe the replicas while it advances them."""
-
-    def __call__(
-        self,
-        flow: ShearFlow,
-        numerics: Numerics,
-        state: State,
-        steps: Array | np.ndarray,
-        observe: Observe | None = None,
-    ) -> tuple[State, Tally]: ...
 
 
 def advance_batch(
@@ -73,17 +58,15 @@ def advance_batch(
     return run(_observe_replica, shared=(numerics,), static=(observe,))
 
 
-def reporting(advance: ObserveBatch, report: Report) -> ObserveBatch:
-    """The same advance with a report after each call."""
+def reporting(
+    advance: AdvanceBatch, report: Callable[[ArrayLike, ArrayLike], None]
+) -> AdvanceBatch:
+    """The same advance with a report of time step and number of steps of each replica after each
+    call.
+    """
 
-    def advance_and_report(
-        flow: ShearFlow,
-        numerics: Numerics,
-        state: State,
-        steps: Array | np.ndarray,
-        observe: Observe | None = None,
-    ) -> tuple[State, Tally]:
-        state, tally = advance(flow, numerics, state, steps, observe)
+    def advance_and_report(flow: ShearFlow, *others: Any, **observed: Any) -> tuple[State, Tally]:
+        state, tally = advance(flow, *others, **observed)
         report(flow.timestep, tally.steps)
         return state, tally
 

@@ -22,12 +22,7 @@ from jaxgran.sampling.averages import averages
 from jaxgran.sampling.correlation_strain import flow_correlation_strain, mass_of_grains
 from jaxgran.sampling.observables import OBSERVABLES, Observables
 from jaxgran.sampling.timestep import deepest_overlap, stress_error
-from jaxgran.statistics import (
-    Estimates,
-    correlation_length,
-    merged_blocks,
-    standard_errors,
-)
+from jaxgran.statistics import Estimates, correlation_length, merged_blocks, standard_errors
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -32,7 +32,9 @@ def dataset_of(sample: "Sample") -> xr.Dataset:
     for name, row in OBSERVABLES.items():
         dims = (*replicas, *row.axes)
         variables[name] = dims, values[name], _about(row.meaning, row.unit)
-        variables[f"{name}_stderr"] = dims, errors[name], _about(row.meaning_of_error, row.unit)
+        error = "standard deviation over blocks" if row.extreme else "standard error"
+        about = _about(f"{error} of {row.meaning}", row.unit)
+        variables[f"{name}_stderr"] = dims, errors[name], about
     for name, (meaning, unit) in _PARAMETERS.items():
         variables[name] = replicas, getattr(sample.flow, name), _about(meaning, unit)
     flags = {

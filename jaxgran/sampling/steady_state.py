@@ -38,10 +38,7 @@ from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import GIVEN_UP, Status
 from jaxgran.sampling.blocks import Batch, shear_by_block
-from jaxgran.sampling.correlation_strain import (
-    flow_correlation_strain,
-    total_mass,
-)
+from jaxgran.sampling.correlation_strain import flow_correlation_strain, total_mass
 from jaxgran.sampling.drift import is_level, is_level_noise
 from jaxgran.sampling.heated import heat_replica, replicas_of_keys, require_uncompiled
 from jaxgran.sampling.observe import AdvanceBatch, advance_batch

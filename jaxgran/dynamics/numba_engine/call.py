@@ -121,12 +121,7 @@ def call_numba(
         activation=flow.activation,
         max_steps=solver.max_steps,
     )
-    shapes = [
-        state.positions.shape,
-        state.positions.shape,
-        (*steps.shape, layout.RESULTS),
-        records,
-    ]
+    shapes = [state.positions.shape, state.positions.shape, (*steps.shape, layout.RESULTS), records]
     results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
     operands = (
         state.positions,

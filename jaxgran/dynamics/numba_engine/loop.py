@@ -64,11 +64,7 @@ from jaxgran.dynamics.numba_engine.motion import (
 from jaxgran.dynamics.numba_engine.near_pairs import LIFE, closing_speed_bound, search
 from jaxgran.dynamics.numba_engine.records import record_contacts, record_flight
 from jaxgran.dynamics.numba_engine.sums import COLLISIONS, add_flight
-from jaxgran.dynamics.numba_engine.velocity_scales import (
-    DURATION,
-    READ_UNTIL,
-    read_velocity_scales,
-)
+from jaxgran.dynamics.numba_engine.velocity_scales import DURATION, READ_UNTIL, read_velocity_scales
 from jaxgran.dynamics.velocity_scales import READ_AFTER
 
 image_in_cell, remap_tilt = CELL["image_in_cell"], CELL["remap_tilt"]
