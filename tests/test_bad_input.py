@@ -49,6 +49,10 @@ from jaxgran.plotting import theory
 from jaxgran.plotting.movie import check_movie
 from jaxgran.sampling import heated, sampler, steady_state
 from jaxgran.sampling.observe import observed_shapes
+from jaxgran.theory.corrected_shear import corrected_shear
+from jaxgran.theory.enskog import collisional_transfer
+from jaxgran.theory.gaussian_moments import gaussian_moments
+from jaxgran.theory.navier_stokes import garzo_dufty
 
 GRAINS = 32
 FLOW = {"grains": GRAINS, "restitution": 0.5, "packing_fraction": 0.6, "timestep": 1e-3}
@@ -244,8 +248,18 @@ BATCH = jg.ShearFlow(GRAINS, [0.5, 0.9], 0.6, 1e-3)
 EVEN = jg.DelassusProblem(np.eye(2), -np.ones(2))
 PAIR = jg.ContactNetwork([[0, 1]], [[1.0, 0.0]], [1, 1], [-1])
 RATIOS = ratio_dataset()
+LAW = jg.constitutive_law()
 LOST = replace(SEEN.state, positions=np.nan * SEEN.state.positions)
 HALF, LAST = jnp.full(GRAINS, 0.5), np.append(np.ones(GRAINS - 1), 9.0)
+
+
+class Counter:
+    """A function that is equal to others, so that no program can be known by it."""
+
+    __hash__ = None
+
+    def __call__(self, seen: Any) -> Any:
+        return seen.impulses.sum()
 
 
 def sheared(**changes: Any) -> Any:
@@ -311,12 +325,19 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "no total momentum": lambda: sheared(velocities=np.ones((GRAINS, 2))),
     "0.6, which the state has": lambda: jg.sample(DILUTE, SEEN.state, 1.0),
     "its numbers are float32 and float64": lambda: sheared(tilt=np.float32(0)),
+    "velocities are of the type list": lambda: sheared(velocities=PLACES[0].tolist()),
+    "steps must be one number": lambda: jg.count_events(flow(), SEEN.state, np.array([5, 5])),
+    "at least 1.6e-05 / shear_rate": lambda: jg.snapshot_series(
+        make_flow("timestep", 1e-7), SINGLE, 1e-3, 4
+    ),
     "a whole number of 0 to 2147483647": lambda: jg.advance(flow(), SEEN.state, 2**31),
     "count must be at most": lambda: jg.snapshot_series(flow(), SEEN.state, 1.0, 10**9),
     "strain must be": lambda: jg.snapshot_series(flow(), SEEN.state, 1e-3, 5),
     "which varies: sum over the contacts": lambda: observing(lambda seen: seen.impulses),
     "observe must return real numbers": lambda: observing(lambda _: 1j),
     "observe must return at least one number, not": lambda: observing(lambda _: {}),
+    "observe must be hashable": lambda: jg.sample(flow(), SEEN.state, 1.0, observe=Counter()),
+    "observe must return real numbers, not": lambda: observing(lambda _: jax.random.key(0)),
     "restitution must be one first guess": lambda: fitting(flow=make_flow("restitution", 1.0)),
     "position_noise must be above 0": lambda: fitting(position_noise=0.0),
     "iterations must be a whole number of at least 10": lambda: fitting(iterations=1),
@@ -335,6 +356,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "unit vectors": lambda: solving(PAIR, normals=2 * np.ones((1, 2))),
     "impulses must be an array (2,)": lambda: contact_residual(EVEN, np.zeros(1)),
     # maps
+    "a number or a list of numbers, not (True": lambda: make_map("restitution", [True, 0.5]),
     "must be a list without repetition, in any": lambda: make_map("restitution", (0.5, 0.9, 0.5)),
     "at most 1000000 replicas, points times seeds": lambda: make_map("seeds", 600_000),
     "first_seed must be a whole number of at least 0": lambda: make_map("first_seed", -1),
@@ -370,6 +392,17 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "trajectory must be": lambda: check_trajectory(Path("flow.nc")),
     "seen must be a flow of finite": lambda: jg.flow_figure(replace(SEEN, state=LOST)),
     "there is no file": lambda: jg.read_trajectory("none.gsd"),
+    # theories and the law
+    "packing_fraction must be above 0 and below 1": lambda: gaussian_moments(0.5, 1.2),
+    "restitution must be between 0 and 1, not 1.5": lambda: garzo_dufty(1.5, 0.6),
+    "restitution must be between 0 and 1, not -0.5": lambda: corrected_shear(-0.5, 0.6),
+    "polydispersity must be at least 0 and below": lambda: gaussian_moments(0.5, 0.6, 1.0, 1.5),
+    "temperature must be a tensor (2, 2)": lambda: collisional_transfer(np.ones(4), 0.5, 0.6),
+    "shape that broadcasts with those of": lambda: LAW([0.5, 0.6], 0.6, [1.0, 2.0, 3.0]),
+    "the reference map, not [0.5, None]": lambda: LAW(np.ma.array([0.5, 1], mask=[0, 1]), 0.6),
+    "path must be in a folder that exists": lambda: LAW.to_csv("none/law.csv"),
+    "count must be a whole number of at least 1": lambda: jg.grid(1.0, 0),
+    "side must be a positive number": lambda: jg.grid(-1.0, 2),
     "shapes that broadcast, not (1, 2) and (3,)": lambda: jg.validity([[0.5, 0.6]], 3 * [0.6]),
 }
 

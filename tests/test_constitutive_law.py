@@ -49,6 +49,19 @@ def test_power_of_the_shear_is_dissipated_within_the_errors() -> None:
     assert np.all(apart < 0.05 * loss.value)
 
 
+@pytest.mark.parametrize("at", [(0.5, 0.6), (0.9, 0.7), (0.47, 0.61)])
+def test_second_derivatives_are_those_of_finite_differences(at: tuple[float, float]) -> None:
+    """At a point of the reference map, and between its points."""
+    change, e = np.eye(2), 1e-3
+
+    def slope(where: Any) -> Any:
+        return jax.grad(lambda x: LAW(x[0], x[1]).pressure.value)(where)
+
+    hessian = jax.jit(jax.jacfwd(slope))(jnp.array(at))
+    differences = [(slope(at + e * x) - slope(at - e * x)) / (2 * e) for x in change]
+    np.testing.assert_allclose(hessian, differences, rtol=2e-3, atol=0.1)
+
+
 def test_long_waves_raise_the_granular_temperature() -> None:
     flow = LAW(*a_plane())
     highest = flow.granular_temperature.value + flow.granular_temperature.ci95

@@ -108,6 +108,22 @@ def test_residual_vanishes_at_a_solution_and_where_nothing_approaches():
     assert contact_residual(apart, jnp.zeros(SIZE)) == 0
 
 
+@pytest.mark.parametrize(
+    ("speed", "kind"), [(1e-3, np.float16), (1e-25, np.float32), (1e-200, float), (1e200, float)]
+)
+def test_solution_does_not_depend_on_the_unit_of_speed(speed, kind):
+    """Half precision is solved in single precision."""
+    normals, ends = np.array([[1, 0], [1, 0]], kind), np.array([[1, 0], [2, 1]], ">i4")
+    row = ContactNetwork(ends, normals, np.ones(3, kind), np.array([-speed, 0], kind))
+    solution = solve_contacts(row, 1.0)
+    impulses = np.asarray(solution.impulses, float) / float(-row.approach[0])
+    np.testing.assert_allclose(impulses, [4 / 3, 2 / 3], rtol=1e-5)
+    assert solution.status == Status.ok and solution.residual < 1e-6
+    apart = replace(row, approach=np.array([0, speed], kind))
+    stuck = contact_residual(apart, np.array([0.5 * speed, 0], kind))
+    np.testing.assert_allclose(stuck, speed, rtol=1e-2)
+
+
 def test_dense_and_sparse_matrices_are_the_same_problem():
     network, matrix, _ = network_of(3, 20)
     matrix = matrix + np.diag(np.diag(matrix) == 0)

@@ -38,12 +38,14 @@ from jaxgran.model.checks import (
     concrete_or_none,
     require,
     require_number,
+    require_whole,
 )
 from jaxgran.model.state import State
 from jaxgran.model.values import Value
 
 _REACH = 6.0  # widths, at which the Gaussian has fallen to e⁻¹⁸ = 1.5e-8 of its peak
 _NEGLIGIBLE = 9.0  # widths, at which it is e⁻⁴⁰ = 3e-18 of its peak, below rounding
+_MOST_POINTS = 10_000  # along each side of a grid
 _BLOCK = 128  # points, grains or contacts
 
 
@@ -127,6 +129,8 @@ def grid(side: float | Array, count: int) -> Float[Array, "points 2"]:
 
     The square [0, ℓ)² is one cell of the sheared lattice at any tilt.
     """
+    require_number("side", side, lambda x: (x > 0) & np.isfinite(x), "a positive number")
+    require_whole("count", count, 1, _MOST_POINTS, "as memory is limited")
     ticks = (jnp.arange(count, dtype=jnp.result_type(side, float)) + 0.5) * (side / count)
     return jnp.stack([jnp.tile(ticks, count), jnp.repeat(ticks, count)], axis=-1)
 

@@ -69,8 +69,8 @@ class ContactNetwork(Value):
     approach: Float[Array, " contacts"]
 
     def __post_init__(self) -> None:
-        ends = np.asarray(self.ends) if isinstance(self.ends, (list, tuple)) else self.ends
-        object.__setattr__(self, "ends", ends)
+        listed = isinstance(self.ends, (list, tuple))  # whose numbers stay whole
+        object.__setattr__(self, "ends", as_array(np.asarray(self.ends) if listed else self.ends))
         _lists_as_arrays(self, "normals", "masses", "approach")
 
     def operator(self) -> NetworkOperator:
@@ -176,8 +176,9 @@ def as_problem(problem: ContactProblem) -> ContactProblem:
     names = ("normals", "masses") if isinstance(problem, ContactNetwork) else ("matrix",)
     numbers = {name: getattr(problem, name) for name in (*names, "approach")}
     common = np.result_type(*(x.dtype for x in numbers.values()))
-    is_float = jnp.issubdtype(common, jnp.floating)
-    dtype = jax.dtypes.canonicalize_dtype(common if is_float else np.float64)
+    if common.itemsize < 4 and jnp.issubdtype(common, jnp.floating):  # half precision
+        common = np.dtype(np.float32)
+    dtype = jax.dtypes.canonicalize_dtype(common if common == np.float32 else np.float64)
     return replace(problem, **{name: x.astype(dtype) for name, x in numbers.items()})
 
 

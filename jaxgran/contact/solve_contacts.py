@@ -6,7 +6,7 @@ map, ‖min(W_cc J, w)‖ over the speed (1 + α) ‖min(u⁻, 0)‖ that stops 
 does not depend on units, and a list of problems has comparable numbers.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -146,13 +146,15 @@ def _of_precision(kind: Any, number: Any) -> Array:
 def _solved(
     problem: ContactProblem, restitution: Array, solver: ProjectedMethod
 ) -> ContactSolution:
-    operator = problem.operator()
+    unit = _speed_of(problem)
+    scaled = replace(problem, approach=problem.approach / unit)
+    operator = scaled.operator()
     fastest = lax.stop_gradient(jnp.max(jnp.abs(operator.approach)))
     solution = solve(operator, fastest, solver, jnp.asarray(True))
-    impulses = (1 + restitution) * solution.impulses
+    impulses = (1 + restitution) * solution.impulses * unit
     return ContactSolution(
         impulses=impulses,
-        velocities=operator.approach + (1 + restitution) * solution.response,
+        velocities=(operator.approach + (1 + restitution) * solution.response) * unit,
         residual=_residual(problem, impulses, restitution),
         iterations=solution.iterations,
         status=solution.status,
@@ -161,9 +163,20 @@ def _solved(
 
 @jax.jit
 def _residual(problem: ContactProblem, impulses: Array, restitution: Array) -> Float[Array, ""]:
-    operator = problem.operator()
+    unit = _speed_of(problem)
+    operator = replace(problem, approach=problem.approach / unit).operator()
+    impulses = impulses / unit
     after = operator.product(impulses) + (1 + restitution) * operator.approach
     stopped = (1 + restitution) * jnp.minimum(operator.approach, 0)
     speed = jnp.sqrt(dot(stopped, stopped))
     residual = natural_map(operator.diagonal(), impulses, after)
-    return lax.stop_gradient(residual / jnp.where(speed > 0, speed, 1))
+    return lax.stop_gradient(residual / jnp.where(speed > 0, speed, 1 / unit))
+
+
+def _speed_of(problem: ContactProblem) -> Float[Array, ""]:
+    """A power of two near the largest speed, in which no square over- or underflows; division by it
+    is exact.
+    """
+    fastest = lax.stop_gradient(jnp.max(jnp.abs(problem.approach)))
+    exponent = jnp.frexp(jnp.where((fastest > 0) & jnp.isfinite(fastest), fastest, 1))[1]
+    return jnp.ldexp(jnp.ones((), fastest.dtype), exponent - 1)

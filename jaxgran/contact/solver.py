@@ -28,7 +28,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import DelassusOperator, NetworkOperator
@@ -150,15 +149,35 @@ def _solve_jvp(primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
         return jnp.where(loaded, operator.product(jnp.where(loaded, x, 0)), x)
 
     def by_conjugate_gradients(matvec: Callable, target: Array) -> Array:
-        x, _ = cg(
-            matvec,
-            target,
-            tol=_DERIVATIVE_TOLERANCE,
-            maxiter=_DERIVATIVE_ITERATIONS * impulses.size,
-            M=lambda residual: residual / w_diagonal,
+        square = dot(target, target)
+
+        def unfinished(now: _Gradients) -> Array:
+            few = now.iterations < _DERIVATIVE_ITERATIONS * impulses.size
+            return few & (now.least > _DERIVATIVE_TOLERANCE**2 * square) & jnp.isfinite(now.weight)
+
+        def iterate(now: _Gradients) -> _Gradients:
+            change = matvec(now.direction)
+            length = now.weight / dot(now.direction, change)
+            x, residual = now.x + length * now.direction, now.residual - length * change
+            scaled, size = residual / w_diagonal, dot(residual, residual)
+            weight, better = dot(residual, scaled), size < now.least
+            return _Gradients(
+                x,
+                residual,
+                scaled + weight / now.weight * now.direction,
+                weight,
+                jnp.where(better, x, now.best),
+                jnp.where(better, size, now.least),
+                now.iterations + 1,
+            )
+
+        zero, scaled = jnp.zeros_like(target), target / w_diagonal
+        start = _Gradients(
+            zero, target, scaled, dot(target, scaled), zero, square, jnp.zeros((), jnp.int32)
         )
+        x = lax.while_loop(unfinished, iterate, start).best
         residual = target - matvec(x)
-        converged = dot(residual, residual) <= _WORST_DERIVATIVE**2 * dot(target, target)
+        converged = dot(residual, residual) <= _WORST_DERIVATIVE**2 * square
         return jnp.where(converged, x, jnp.nan)
 
     _, response_change = jax.jvp(lambda w: w.product(impulses), (operator,), (change,))
@@ -174,6 +193,20 @@ def _solve_jvp(primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
         iterations=no_tangent,
         status=no_tangent,
     )
+
+
+class _Gradients(NamedTuple):
+    """Conjugate gradients: rounding lets them diverge where a matrix is singular, so the best
+    iterate is kept.
+    """
+
+    x: Array
+    residual: Array
+    direction: Array
+    weight: Array  # of the residual, in the norm of the preconditioner
+    best: Array
+    least: Array  # squared residual of the best
+    iterations: Array
 
 
 def single_contact(operator: NetworkOperator) -> Solution:

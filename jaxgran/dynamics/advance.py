@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
@@ -12,7 +13,7 @@ from jaxgran.dynamics.engine import Engine, Jax, Numba, Numerics, checked_numeri
 from jaxgran.dynamics.jax_engine import events_by_jax
 from jaxgran.dynamics.observer import Observe, uses_traced_values
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.checks import require, require_function
+from jaxgran.model.checks import refused, require, require_function
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.flow import ShearFlow, flow_of_state
 from jaxgran.model.state import State, require_state
@@ -131,4 +132,7 @@ def count_events(
     """
     require_advance(flow, state, steps)
     require_solver(solver)
-    return events_by_jax(flow, solver, state, steps)
+    if np.shape(steps):
+        raise refused("steps", steps, "must be one number")
+    flow, solver, state = jax.tree.map(jnp.array, (flow, solver, state))
+    return events_by_jax(flow, solver, state, jnp.array(steps, jnp.int32))

@@ -32,9 +32,7 @@ from jaxgran.environment import default_device, on_processor, precision
 from jaxgran.model.checks import InputError, refused, require_flag, require_whole
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.state import State
-
-_ENABLE_X64 = 'jax.config.update("jax_enable_x64", True)'
+from jaxgran.model.state import ENABLE_X64, State
 
 
 @dataclass(frozen=True)
@@ -133,7 +131,7 @@ class Numba:
         """What this engine cannot do of what is asked for, in words; "" if it can do all."""
         wrong = {
             f"on the device {default_device().platform}": not (on_processor() or has_cuda()),
-            f"in {dtype} ({_ENABLE_X64} computes in float64)": dtype != "float64",
+            f"in {dtype} ({ENABLE_X64} computes in float64)": dtype != "float64",
             f"with the solver {solver_name(solver)}": type(solver) is not BarzilaiBorwein,
         }
         return " and ".join(words for words, holds in wrong.items() if holds)
@@ -220,15 +218,9 @@ def select_engine(numerics: Numerics, state: State | None = None) -> Engine:
       state: gives the precision; None for JAX's default precision.
 
     Raises:
-      InputError: the engine that was asked for cannot do this, or JAX computes in single precision
-        and the state is in double precision.
+      InputError: the engine that was asked for cannot do this.
     """
     dtype = precision() if state is None else str(state.positions.dtype)
-    if dtype == "float64" != precision():
-        raise InputError(
-            "state must be of the precision in which JAX computes, float32, not float64: begin "
-            f"with {_ENABLE_X64}."
-        )
     engine = numerics.engine or (Numba() if on_processor() else Jax())
     wrong = engine.refuses(dtype, numerics.solver)
     if not wrong:
@@ -244,7 +236,7 @@ def select_engine(numerics: Numerics, state: State | None = None) -> Engine:
     ):
         _warn_once(
             "JAX computes in single precision, in which flows take the engine jax, several times "
-            f"slower than the numba engine: begin with {_ENABLE_X64}."
+            f"slower than the numba engine: begin with {ENABLE_X64}."
         )
     return Jax()
 

@@ -98,7 +98,10 @@ def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> O
             if not jax.tree.leaves(values):
                 raise refused("observe", values, "must return at least one number")
             for x in jax.tree.leaves(values):
-                if not isinstance(x, _NUMBERS) or jnp.asarray(x).dtype.kind not in "biuf":
+                kind = (
+                    getattr(jnp.asarray(x).dtype, "kind", None) if isinstance(x, _NUMBERS) else None
+                )
+                if kind not in (*"biuf",):  # random keys have none
                     raise refused("observe", x, "must return real numbers")
             return jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), dtype), values)
 

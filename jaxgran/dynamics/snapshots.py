@@ -24,7 +24,7 @@ from jaxgran.dynamics.snapshot import Snapshot, snapshot_of
 from jaxgran.dynamics.step import closing_speed_bound
 from jaxgran.model.checks import as_array, require, require_whole
 from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
-from jaxgran.model.state import State, require_state
+from jaxgran.model.state import State, check_precision, require_state
 from jaxgran.model.status import Status
 
 _MOST_GRAIN_SNAPSHOTS = 10**9  # snapshots times grains of one series; memory is limited
@@ -109,6 +109,7 @@ def _require_series(count: int, flow: ShearFlow, state: State, strain: Any) -> N
     require_state(flow, state)
     require_whole("count", count, 1, _MOST_GRAIN_SNAPSHOTS // flow.grains, "as memory is limited")
     require_strain(flow, strain, count)
+    check_precision(flow, state)
 
 
 @partial(jax.jit, static_argnames="count")

@@ -299,6 +299,8 @@ def _plain(value: Any, kind: Any) -> Any:
         ):
             return value
         if isinstance(value, (list, tuple)):
+            if any(isinstance(x, bool) for x in value):  # which NumPy would take for numbers
+                return tuple(value)
             value = [rounded(x) if isinstance(x, _SHORT_FLOATS) else x for x in value]
         array = np.asarray(value)
     except (TypeError, ValueError):  # a random key, or lists of different lengths

@@ -23,6 +23,7 @@ from jaxgran.model.checks import (
     InputError,
     refused,
     require_flag,
+    require_function,
     require_number,
     require_whole,
     short_repr,
@@ -142,10 +143,7 @@ def _check_observe(observe: Any, flow: ShearFlow) -> None:
     if not callable(observe):
         reason = "must be a function that is passed to `ratio_map`, or None"
         raise refused("observe", observe, reason)
-    try:
-        hash(observe)
-    except TypeError:
-        raise refused("observe", observe, "must be hashable") from None
+    require_function("observe", observe)
     shapes = observed_shapes(observe, flow)
     names = list(shapes) if isinstance(shapes, dict) else []
     if not names or not all(isinstance(x, jax.ShapeDtypeStruct) for x in shapes.values()):

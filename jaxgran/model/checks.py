@@ -179,9 +179,15 @@ def require_flag(name: str, value: Any) -> None:
 
 
 def require_function(name: str, value: Any) -> None:
-    """Raise an InputError unless the value is a function or None."""
+    """Raise an InputError unless the value is a function or None, by which JAX can know a compiled
+    program.
+    """
     if value is not None and not callable(value):
         raise refused(name, value, "must be a function or None")
+    try:
+        hash(value)
+    except TypeError:
+        raise refused(name, value, "must be hashable") from None
 
 
 def is_traced(*values: Any) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxgran.model.checks import InputError, concrete_or_none, require_native
+from jaxgran.model.checks import InputError, concrete_or_none, is_traced, require_native, two_digits
 from jaxgran.model.display import rounded
 from jaxgran.model.flow import ShearFlow, require_flow
 from jaxgran.model.grains import Grains
@@ -20,6 +20,8 @@ from jaxgran.model.values import Indexable, in_numpy
 
 _ROUNDING = 1e-5  # of a packing fraction in float32, with some room
 _POSITIVE = ("radii", "masses", "side")
+_SMALLEST_MOTION = 20  # of a grain at velocity γ̇σ in one step, in roundings of a position
+ENABLE_X64 = 'jax.config.update("jax_enable_x64", True)'
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -118,11 +120,11 @@ def require_state(flow: ShearFlow, state: State) -> None:
     radii, positions, side, tilt = (known[x] for x in ("radii", "positions", "side", "tilt"))
     if radii is None or side is None:
         return
-    nu = concrete_or_none(flow.packing_fraction)
-    if nu is not None and not _has_fraction_of(flow, state):
+    nu, of_state = concrete_or_none(flow.packing_fraction), np.pi * np.sum(radii**2) / side**2
+    if nu is not None and not abs(of_state - nu) <= _ROUNDING:
         raise InputError(
-            f"packing_fraction must be {float(state.packing_fraction):.6g}, which the state has, "
-            f"not {nu:g}: a flow with another one begins with a state of its own, from prepare."
+            f"packing_fraction must be {of_state:.6g}, which the state has, not {nu:g}: a flow "
+            "with another one begins with a state of its own, from prepare."
         )
     if positions is not None and tilt is not None:
         _require_apart(radii, positions, float(side), float(tilt))
@@ -142,7 +144,7 @@ def status_at_start(flow: ShearFlow, state: State) -> Int[Array, ""]:
             *map(jnp.isfinite, jax.tree.leaves(flow)),
             jnp.asarray(flow.timestep) > 0,
             jnp.asarray(flow.shear_rate) >= 0,
-            _has_fraction_of(flow, state),
+            abs(state.packing_fraction - flow.packing_fraction) <= _ROUNDING,
         )
     )
 
@@ -159,15 +161,16 @@ def _accepts(name: str, numbers: Any, xp: Any) -> Any:
     return finite & (numbers > 0) if name in _POSITIVE else finite
 
 
-def _has_fraction_of(flow: ShearFlow, state: State) -> Any:
-    return abs(state.packing_fraction - flow.packing_fraction) <= _ROUNDING
-
-
 def _require_arrays(grains: int, arrays: dict[str, Any]) -> None:
     """Raise an InputError unless the arrays have the shapes of a state, and one precision."""
     vectors, numbers = ("positions", "velocities"), ("side", "tilt")
     for name, x in arrays.items():
         shape = (grains, 2) if name in vectors else () if name in numbers else (grains,)
+        if not hasattr(x, "dtype") and not isinstance(x, (int, float)):
+            raise InputError(
+                f"state must have arrays, and its {name} are of the type {type(x).__name__}: "
+                "jnp.asarray makes an array of a list."
+            )
         if np.shape(x) != shape:
             raise InputError(
                 f"state must be one State of {grains} grains, best from prepare, of {name} "
@@ -180,6 +183,40 @@ def _require_arrays(grains: int, arrays: dict[str, Any]) -> None:
             "jax.tree.map(lambda x: x.astype(float), state) makes them one."
         )
     require_native("state", arrays)
+    if precisions == ["float64"] and jnp.result_type(float) != np.float64:
+        raise InputError(
+            "state must be of the precision in which JAX computes, float32, not float64: begin "
+            f"with {ENABLE_X64}."
+        )
+
+
+def check_precision(flow: ShearFlow, state: State) -> None:
+    """Raise an InputError if positions cannot resolve the time step; traced values are not checked.
+
+    In one step a grain at velocity γ̇σ moves by γ̇ dt σ. In float32 a position in a cell of 20 σ is
+    rounded to 2e-6 σ.
+
+    The engines add the motion to displacements since the last build of the lists, which are far
+    smaller. So a flow is wrong only if a step moves a pair by less than the rounding of its
+    separation, 1e-7 σ. But summed times drift by 1e-3, and programs that compare the positions of
+    two states see their rounding. So the limit is that of positions.
+    """
+    if is_traced(flow.timestep, flow.shear_rate, state.side):
+        return
+    rounding = np.finfo(state.positions.dtype).eps * float(np.asarray(state.side).max())
+    slowest = np.finfo(state.positions.dtype).smallest_normal ** (1 / 3)
+    if (slow := float(np.min(np.asarray(flow.shear_rate, float)))) < slowest:
+        raise InputError(
+            f"shear_rate must be at least {two_digits(slowest, up=True)} in "
+            f"{state.positions.dtype}, not {slow:g}: its cube would underflow."
+        )
+    least = _SMALLEST_MOTION * rounding
+    if float(np.min(np.asarray(flow.timestep) * np.asarray(flow.shear_rate))) < least:
+        raise InputError(
+            f"timestep must be at least {two_digits(least, up=True)} / shear_rate for positions in "
+            f"{state.positions.dtype}: use a longer one, or float64 "
+            f"({ENABLE_X64})."
+        )
 
 
 def _require_apart(radii: np.ndarray, positions: np.ndarray, side: float, tilt: float) -> None:

@@ -99,6 +99,8 @@ def _in_range(name: str, value: Any, low: float, high: float) -> np.ndarray:
         numbers = np.asarray(value, float)
     except (TypeError, ValueError):
         numbers = np.array(np.nan)
+    if isinstance(value, np.ma.MaskedArray):  # whose mask would be ignored
+        numbers = np.array(np.nan)
     within = at_most(low, numbers, _SINGLE) & at_most(numbers, high, _SINGLE)
     if numbers.size == 0 or not np.all(within):
         wrong = numbers[~within].flat[0] if np.isfinite(numbers).any() else value

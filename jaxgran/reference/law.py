@@ -13,8 +13,8 @@ from jax.tree_util import register_static
 
 import jaxgran
 from jaxgran.files import atomic_write
-from jaxgran.io.paths import require_absent
-from jaxgran.model.checks import as_array, require
+from jaxgran.io.paths import as_path, require_absent, require_place
+from jaxgran.model.checks import as_array, refused, require
 from jaxgran.model.display import WithError, text_of
 from jaxgran.reference.evaluation import PLANE, Estimate, from_log, module_of, over_range
 from jaxgran.reference.table import LENGTH, MEASURED, Table, shipped_table, theory_of, write_columns
@@ -117,7 +117,12 @@ class ConstitutiveLaw:
         shear_rate = as_array(shear_rate)
         require("shear_rate", shear_rate, lambda x: x > 0, "a positive number")
         *_, averages = over_range(self.table, self._at_unit_rate, restitution, packing_fraction)
-        xp = module_of(restitution, packing_fraction, shear_rate)
+        xp, shape = module_of(restitution, packing_fraction, shear_rate), np.shape(shear_rate)
+        try:
+            np.broadcast_shapes(np.shape(averages["pressure"].value), shape)
+        except ValueError:
+            reason = "must have a shape that broadcasts with those of α and ν"
+            raise refused("shear_rate", shape, reason) from None
         scaled = {}
         for name, estimate in averages.items():
             *numbers, rate = xp.broadcast_arrays(*estimate, xp.asarray(shear_rate, float))
@@ -155,8 +160,10 @@ class ConstitutiveLaw:
         Raises:
           InputError: (a ValueError) a value is outside the measured range, or the file exists.
         """
+        path = as_path("path", path)
+        require_place(path, "path", path.suffix)
         if not overwrite:
-            require_absent(Path(path), "law")
+            require_absent(path, "law")
         low, high = self.packing_fraction_range
         alphas = (
             np.unique(self.table.columns["restitution"])
@@ -179,7 +186,7 @@ class ConstitutiveLaw:
             **{f"unit of {name}": unit for name, unit in _UNITS.items()},
             **_MEANING,
         }
-        with atomic_write(Path(path)) as temporary:
+        with atomic_write(path) as temporary:
             write_columns(temporary, head, columns)
 
 

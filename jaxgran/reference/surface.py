@@ -20,6 +20,7 @@ import numpy as np
 _JAMMING = 0.86  # beyond the densest flow; the onset of rigidity lies near 0.85
 _SLOPE = 5.0  # prior standard deviation of the plane's three coefficients: wide
 _TINY = 1e-30  # under a root, whose derivative at zero would be infinite
+_NEAR = 1e-8  # squared distance below which the Matérn function is a polynomial to rounding
 
 
 def coordinates(restitution: Any, packing_fraction: Any, xp: Any = np) -> Any:
@@ -46,9 +47,12 @@ class Shape:
     def covariance(self, where: Any, points: Any, xp: Any = np) -> Any:
         """Prior covariance of (..., 2) and (points, 2) coordinates, (..., points)."""
         first, second = ((where[..., None, k] - points[:, k]) / self.lengths[k] for k in (0, 1))
-        r = xp.sqrt(5 * (first**2 + second**2) + _TINY)
-        plane = _SLOPE**2 * (1 + where @ points.T)
-        return self.amplitude**2 * (1 + r + r**2 / 3) * xp.exp(-r) + plane
+        square = 5 * (first**2 + second**2)
+        near = square < _NEAR  # second derivatives of the root would multiply rounding
+        r = xp.sqrt(xp.where(near, 1, square))
+        far = (1 + r + r**2 / 3) * xp.exp(-r)
+        matern = xp.where(near, 1 - square / 6 + square**2 / 24, far)
+        return self.amplitude**2 * matern + _SLOPE**2 * (1 + where @ points.T)
 
     def variance(self, where: Any, xp: Any = np) -> Any:
         """Prior variance at (..., 2) coordinates."""

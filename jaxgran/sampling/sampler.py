@@ -25,7 +25,6 @@ from jaxgran.model.checks import (
     require,
     require_function,
     require_whole,
-    two_digits,
 )
 from jaxgran.model.flow import (
     ShearFlow,
@@ -35,7 +34,7 @@ from jaxgran.model.flow import (
     steps_of_blocks,
     steps_of_strain,
 )
-from jaxgran.model.state import State, require_state
+from jaxgran.model.state import State, check_precision, require_state
 from jaxgran.sampling.blocks import advance_by_block, sample_of_blocks
 from jaxgran.sampling.correlation_strain import length_status, total_mass
 from jaxgran.sampling.observe import advance_batch
@@ -43,7 +42,6 @@ from jaxgran.sampling.sample import BLOCKS, Sample
 
 MOST_BLOCKS = 10**6
 _LARGEST_MOMENTUM = 1e-4  # |Σ m c| over Σ m |c| at the start; rounding leaves 1e-6 at most
-_SMALLEST_MOTION = 20  # of a grain at velocity γ̇σ in one step, in roundings of a position
 
 
 def sample(
@@ -214,32 +212,3 @@ def _with_length(measured: Sample) -> Sample:
     status = jnp.asarray(measured.tally.status)
     worst = jnp.maximum(status[..., -1], jnp.asarray(of_length, status.dtype))
     return replace(measured, tally=replace(measured.tally, status=status.at[..., -1].set(worst)))
-
-
-def check_precision(flow: ShearFlow, state: State) -> None:
-    """Raise an InputError if positions cannot resolve the time step; traced values are not checked.
-
-    In one step a grain at velocity γ̇σ moves by γ̇ dt σ. In float32 a position in a cell of 20 σ is
-    rounded to 2e-6 σ.
-
-    The engines add the motion to displacements since the last build of the lists, which are far
-    smaller. So a flow is wrong only if a step moves a pair by less than the rounding of its
-    separation, 1e-7 σ. But summed times drift by 1e-3, and programs that compare the positions of
-    two states see their rounding. So the limit is that of positions.
-    """
-    if is_traced(flow.timestep, flow.shear_rate, state.side):
-        return
-    rounding = np.finfo(state.positions.dtype).eps * float(np.asarray(state.side).max())
-    slowest = np.finfo(state.positions.dtype).smallest_normal ** (1 / 3)
-    if (slow := float(np.min(np.asarray(flow.shear_rate, float)))) < slowest:
-        raise InputError(
-            f"shear_rate must be at least {two_digits(slowest, up=True)} in "
-            f"{state.positions.dtype}, not {slow:g}: its cube would underflow."
-        )
-    least = _SMALLEST_MOTION * rounding
-    if float(np.min(np.asarray(flow.timestep) * np.asarray(flow.shear_rate))) < least:
-        raise InputError(
-            f"timestep must be at least {two_digits(least, up=True)} / shear_rate for positions in "
-            f"{state.positions.dtype}: use a longer one, or float64 "
-            '(jax.config.update("jax_enable_x64", True)).'
-        )

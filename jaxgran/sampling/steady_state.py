@@ -35,7 +35,7 @@ from jaxgran.environment import usable_threads
 from jaxgran.model.checks import require, require_number
 from jaxgran.model.flow import ShearFlow, require_sheared
 from jaxgran.model.grains import Grains
-from jaxgran.model.state import State
+from jaxgran.model.state import State, check_precision
 from jaxgran.model.status import GIVEN_UP, Status
 from jaxgran.sampling.blocks import Batch, shear_by_block
 from jaxgran.sampling.correlation_strain import flow_correlation_strain, total_mass
@@ -44,7 +44,6 @@ from jaxgran.sampling.heated import heat_replica, replicas_of_keys, require_unco
 from jaxgran.sampling.observe import AdvanceBatch, advance_batch
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.sample import Sample
-from jaxgran.sampling.sampler import check_precision
 from jaxgran.sampling.thresholds import (
     FEWEST_CHUNKS,
     MEASURING_CHUNKS,

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from jaxgran.theory.gaussian_moments import steady_moments
 from jaxgran.theory.mixture import uniform_mixture
 from jaxgran.theory.navier_stokes import garzo_dufty
-from jaxgran.theory.steady_shear import Scalar, as_floats
+from jaxgran.theory.steady_shear import Scalar, as_floats, of_one_flow
 
 Numbers = Array | np.ndarray
 
@@ -96,6 +96,7 @@ class CorrectedShear:
     extrapolated: Bool[Array, "*replicas"]
 
 
+@of_one_flow
 @partial(jax.jit, static_argnames="size_classes")
 def corrected_shear(
     restitution: Scalar,

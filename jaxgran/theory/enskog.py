@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxgran.model.checks import InputError
 from jaxgran.theory.mixture import Mixture, uniform_mixture
-from jaxgran.theory.steady_shear import Scalar, as_floats
+from jaxgran.theory.steady_shear import Scalar, as_floats, of_one_flow
 
 # Contact directions on the half circle; the integrand is smooth and periodic: errors below 1e-11
 _ANGLES = 32
@@ -29,6 +30,7 @@ class Collisions(NamedTuple):
     source: Float[Array, "*replicas 2 2 classes"]  # change of the temperature tensors per time
 
 
+@of_one_flow
 @partial(jax.jit, static_argnames="size_classes")
 def collisional_transfer(
     temperature: Float[Array, "2 2"],
@@ -63,6 +65,8 @@ def collisional_transfer(
       >>> round(float(still.stress[0, 0] / (4 / jnp.pi * 0.5)), 4), round(1.8 * 0.5 * 3.125, 4)
       (2.8125, 2.8125)
     """
+    if jnp.shape(temperature) != (2, 2):
+        raise InputError(f"temperature must be a tensor (2, 2), not {jnp.shape(temperature)}.")
     alpha, nu, rate, width = as_floats(restitution, packing_fraction, shear_rate, polydispersity)
     return enskog_collisions(temperature, alpha, rate, uniform_mixture(nu, width, size_classes))
 

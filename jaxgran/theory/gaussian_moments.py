@@ -15,12 +15,13 @@ from jaxtyping import Array, Float
 from jaxgran.theory.enskog import enskog_collisions
 from jaxgran.theory.mixture import Mixture, mixture_of, uniform_mixture
 from jaxgran.theory.navier_stokes import garzo_dufty
-from jaxgran.theory.steady_shear import Scalar, SteadyShear, as_floats
+from jaxgran.theory.steady_shear import Scalar, SteadyShear, as_floats, of_one_flow
 
 _MAX_ITERATIONS = 40  # of Newton's method, which needs 4 to 7
 _LARGEST_STEP = 1.0  # of one Newton iteration, in the logarithm of a temperature
 
 
+@of_one_flow
 @partial(jax.jit, static_argnames="size_classes")
 def gaussian_moments(
     restitution: Scalar,

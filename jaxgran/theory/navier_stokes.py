@@ -7,9 +7,10 @@ flow at small restitution. Units: ``steady_shear``.
 
 import jax.numpy as jnp
 
-from jaxgran.theory.steady_shear import Scalar, SteadyShear, as_floats, contact_value
+from jaxgran.theory.steady_shear import Scalar, SteadyShear, as_floats, contact_value, of_one_flow
 
 
+@of_one_flow
 def garzo_dufty(
     restitution: Scalar, packing_fraction: Scalar, shear_rate: Scalar = 1.0
 ) -> SteadyShear:

@@ -5,13 +5,28 @@ has mass d² unless its mass is given. All functions are differentiable and trea
 `jax.vmap` adds a leading `(replicas,)`.
 """
 
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import wraps
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Real
 
+from jaxgran.model.checks import require_number
+
 Scalar = float | int | Real[Array, ""]
+T = TypeVar("T")
+
+_RANGES = {
+    "restitution": (lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
+    "packing_fraction": (lambda x: (x > 0) & (x < 1), "above 0 and below 1"),
+    "shear_rate": (lambda x: (x >= 0) & (x < np.inf), "a number of at least 0"),
+    "polydispersity": (lambda x: (x >= 0) & (x < 1), "at least 0 and below 1"),
+}
 
 
 @jax.tree_util.register_dataclass
@@ -60,6 +75,22 @@ def contact_value(packing_fraction: Scalar) -> Float[Array, ""]:
     """
     nu = jnp.asarray(packing_fraction)
     return (1 - 7 * nu / 16) / (1 - nu) ** 2
+
+
+def of_one_flow(theory: Callable[..., T]) -> Callable[..., T]:
+    """The theory, with an InputError where the numbers of the flow are outside of their ranges;
+    traced ones pass.
+    """
+    names = tuple(inspect.signature(theory).parameters)
+
+    @wraps(theory)
+    def checked(*args: Any, **others: Any) -> T:
+        for name, value in (dict(zip(names, args, strict=False)) | others).items():
+            if name in _RANGES:
+                require_number(name, value, *_RANGES[name])
+        return theory(*args, **others)
+
+    return checked
 
 
 def as_floats(*values: Scalar) -> list[Float[Array, ""]]:
