@@ -99,6 +99,14 @@ def is_locked(path: Path, handle: int | None) -> bool:
         return False
 
 
+def stamp(path: Path | None) -> tuple[int, int] | None:
+    """What changes when a file is replaced; None if there is none."""
+    with suppress(OSError, TypeError):
+        status = os.stat(path)  # type: ignore[arg-type]
+        return status.st_ino, status.st_mtime_ns
+    return None
+
+
 def keep_newest(paths: Iterable[Path], most: int) -> None:
     """Remove the oldest of files and folders beyond so many; another process may do the same."""
     with suppress(OSError):

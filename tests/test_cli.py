@@ -31,11 +31,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from PIL import Image
-from synthetic import one_sentence, random_replica
+from synthetic import one_sentence, random_replica, refused
 
 from jaxgran.cli import app, options
 from jaxgran.cli import map as map_module
 from jaxgran.cli.output import in_brackets
+from jaxgran.cli.run import _complete_at_the_end
 from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
 from jaxgran.io import trajectory
@@ -392,6 +393,8 @@ def test_given_options_replace_what_a_file_chose_for_its_error() -> None:
     more = {"restitution": (0.2, 0.5)}
     assert combined(chosen, more) == more | {"grains": "auto", "error": 0.1}
     assert "grains_by_point" not in combined(chosen, {"grains": 256})
+    assert combined({"part": "2/3"}, {"seeds": 2}) == {"part": "2/3", "seeds": 2}
+    assert "part" not in combined({"part": "2/3"}, {"restitution": (0.5,)})
     assert combined(chosen, {"strain": 20.0}).keys() == chosen.keys() - {"error"} | {"strain"}
     given = {"error": 0.1, "grains": 400}
     assert combined({"strain": 4.0, "seeds": 4}, given) == given | {"timestep": "auto", "seeds": 1}
@@ -472,6 +475,36 @@ def test_a_flow_interrupted_before_it_has_a_value_prints_one_sentence(
     assert (as_json.status, as_json.err) == (130, said)
     assert parsed(as_json.out)["force_ratio"]["value"] is None
     assert not files(tmp_path)
+
+
+def test_an_interruption_after_the_result_adds_nothing_to_its_json(
+    tmp_path: Path, monkeypatch
+) -> None:
+    done = made_up_replicas({(0, 0): Status.ok})
+    monkeypatch.setattr(ratio_map_module, "run_replicas", done)
+    monkeypatch.setattr("jaxgran.cli.run.finish", Mock(side_effect=KeyboardInterrupt))
+    outcome = jaxgran(tmp_path, *FLOW.split(), "--json")
+    assert outcome.status == 130 and "error" not in parsed(outcome.out)
+
+
+def test_a_recording_touches_no_frames_but_its_own(tmp_path: Path) -> None:
+    trajectory, own = tmp_path / "flow.gsd", tmp_path / "flow.gsd.unfinished-1"
+    of_another = tmp_path / "flow.gsd.unfinished-2"
+    of_another.write_bytes(b"frames of another")
+    recorded = {"trajectory": trajectory, "unfinished": own}
+    with pytest.raises(OSError), _complete_at_the_end(recorded, overwrite=False):
+        own.write_bytes(b"frames")
+        raise OSError
+    assert files(tmp_path) == {of_another.name}
+    meanwhile = refused("the frames are in .*unfinished-1")
+    with meanwhile, _complete_at_the_end(recorded, overwrite=False):
+        own.write_bytes(b"frames")
+        trajectory.write_bytes(b"written meanwhile")
+    assert trajectory.read_bytes() == b"written meanwhile" and own.read_bytes() == b"frames"
+    with _complete_at_the_end(recorded, overwrite=True):
+        pass
+    assert trajectory.read_bytes() == b"frames" and not own.exists()
+    assert of_another.read_bytes() == b"frames of another"
 
 
 def test_an_interruption_inside_compiled_code_is_one(tmp_path: Path, monkeypatch) -> None:

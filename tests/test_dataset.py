@@ -10,6 +10,7 @@ import xarray as xr
 from made_up_maps import with_variables
 from synthetic import random_replica, refused, replica_id
 
+from jaxgran.cli.summary import summary_of
 from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.replica import Replica
@@ -66,6 +67,17 @@ def test_every_observable_has_its_dimensions_and_errors(data) -> None:
         assert linked[-1] == ("status" if row.group == "/" else "/status")
         if row.group != "diagnostics":
             assert data[f"{path}_stderr"].dims == data[path].dims and f"{name}_stderr" in linked
+
+
+def test_seeds_that_were_given_up_add_no_samples(settings) -> None:
+    rng, one = np.random.default_rng(1), replace(settings, seeds=1)
+    good = [random_replica(rng, settings, Status.ok, point, 0) for point in range(4)]
+    jammed = [random_replica(rng, settings, Status.infeasible, point, 1) for point in range(4)]
+    both = summary_of(map_dataset(replace(settings, seeds=2), good + jammed, RUN))
+    alone = summary_of(map_dataset(one, good, RUN))
+    for name in ("pressure", "granular_temperature"):
+        samples = both[name].effective_samples, alone[name].effective_samples
+        np.testing.assert_allclose(*samples, rtol=1e-9)
 
 
 def test_a_file_of_another_format_is_refused_in_a_sentence(few, tmp_path: Path) -> None:

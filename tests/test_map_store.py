@@ -223,6 +223,41 @@ def test_what_was_being_written_when_a_process_was_killed_is_tidied_up(output: P
     assert not any(litter.exists() for litter in litters) and other.exists()
 
 
+def test_what_is_not_of_the_map_is_left_alone(output: Path) -> None:
+    folder, kept = output.with_name("map.nc.unfinished"), finished(output)
+    output.unlink()
+    run = opened(output, resume=False)
+    for replica in kept:
+        run.add(replica)
+    (folder / "notes.txt").write_text("mine")
+    output.write_bytes(b"of another process")
+    data = map_dataset(SETTINGS, kept, {})
+    with refused("another process wrote meanwhile; the replicas of this one are kept"):
+        run.write(data, interrupted=False)
+    run.close()
+    assert output.read_bytes() == b"of another process"
+    output.unlink()
+    again = opened(output)
+    again.write(data, interrupted=False)
+    again.close(written=True)
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+
+
+def test_replicas_without_settings_are_refused_and_not_removed(output: Path) -> None:
+    cut_off(output)
+    folder = output.with_name("map.nc.unfinished")
+    (folder / "settings.json").unlink()
+    with refused("has replicas, and no settings.json"):
+        opened(output)
+    assert len(list(folder.glob("replica-*.npz"))) == 6
+
+
+def test_a_map_that_cannot_be_extended_names_what_is_in_the_way(output: Path) -> None:
+    finished(output)
+    with refused("solver '.*tolerance"):
+        opened(output, replace(SETTINGS, restitution=(0.5, 0.7, 0.9), solver=LOOSE))
+
+
 def test_a_file_system_without_locks_is_no_obstacle(output: Path, monkeypatch) -> None:
     def no_locks(*_) -> None:
         raise OSError(errno.ENOLCK, "No locks available")

@@ -2,6 +2,7 @@
 --overwrite is given.
 """
 
+import os
 from pathlib import Path
 
 import pytest
@@ -101,6 +102,21 @@ def test_figures_are_those_of_the_data_that_a_command_wrote(tmp_path: Path, monk
     resumed = jaxgran(tmp_path, *MAP, "--resume")
     assert resumed.status == 0 and f"{pdf.name} shows the map as it was" in resumed.err
     assert png.read_bytes() != b"of the half" == pdf.read_bytes()
+
+
+def test_figures_that_are_older_than_the_map_are_drawn_again(
+    finished: bytes, tmp_path: Path
+) -> None:
+    """As after an interruption between the file and its figures."""
+    old, new = tmp_path / "jaxgran_map_curves.png", tmp_path / "jaxgran_map_timestep.png"
+    old.write_bytes(b"of before")
+    os.utime(old, (0, 0))
+    assert jaxgran(tmp_path, *MAP, "--resume").status == 0
+    drawn = old.read_bytes()
+    assert drawn != b"of before" and not new.exists()
+    old.write_bytes(b"of now")
+    assert jaxgran(tmp_path, *MAP, "--resume").status == 0
+    assert old.read_bytes() == b"of now"
 
 
 def test_an_interrupted_map_does_not_replace_a_finished_one(

@@ -63,6 +63,16 @@ def test_the_time_that_is_left_is_known_before_anything_is_done() -> None:
     assert 0 < seconds == pytest.approx(2 * one_seed)
 
 
+def test_a_map_of_which_every_replica_was_resumed_has_no_work_left() -> None:
+    """In any order of their costs, whose sums differ by rounding."""
+    settings, _ = chosen_settings({**MAP, "restitution": (0.2, 0.5, 0.9), "seeds": 5})
+    ids, costs = replica_ids(settings), expected_costs(settings)
+    for seed in range(50):
+        meter = Meter(settings, costs, quiet=True)
+        meter.resumed(ids[k] for k in np.random.default_rng(seed).permutation(len(ids)))
+        assert shares(meter) == ("3/3 points", "100 % of the work done")
+
+
 def test_work_before_a_replica_is_finished_counts_up_to_its_expected_cost() -> None:
     meter = Meter(SETTINGS, expected_costs(SETTINGS), quiet=True)
     first, second = replica_ids(SETTINGS)[:2]

@@ -57,12 +57,12 @@ def run_map_command(
     output = given.setdefault(
         "output", Path("jaxgran_map.nc" if preset == "quick" else f"jaxgran_map_{preset}.nc")
     )
-    whole = "part" not in given  # the rest of a map is in other files
+    whole = "part" not in given
     overwrite, existed = given.get("overwrite", False), os.path.exists(output)
     if whole and not overwrite:
         require_new_figures(output, format)
     data, interrupted, written = run_map(given, quiet)
-    pictures = []
+    whole, pictures = "part" not in data.attrs, []  # the rest of a part is in other files
     if not interrupted:
         with told_how_to_resume(output, finished=True):
             to_draw = data if whole else None
@@ -100,11 +100,14 @@ def draw_beside(
     """Draw the figures of a map beside its file, none of a part. Of a map that was there before,
     remove the others with ``overwrite``, or else name them.
 
-    Figures that are there are kept if the file was not ``written``. The files drawn.
+    Figures that are there are kept if the file was not ``written``, and they are newer. The files
+    drawn.
     """
     from jaxgran.plotting.map_figures import pictures_beside, save_figures
 
-    stem, renew = output.with_suffix(""), overwrite or written
+    stem, made = output.with_suffix(""), os.stat(output).st_mtime_ns if existed else 0
+    old = any(file.stat().st_mtime_ns < made for file in pictures_beside(output))
+    renew = overwrite or written or old
     pictures = [] if data is None else save_figures(data, stem, format, overwrite=renew)
     if renew and existed:
         for file in sorted(pictures_beside(output) - {*pictures}):

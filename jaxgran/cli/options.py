@@ -149,7 +149,11 @@ def _numbers(name: str, text: str) -> tuple[float, ...]:
         return tuple(float(x) for x in text.split(","))
     start, stop, count = text.split(":")
     ends, points = (float(start), float(stop)), int(count)
-    if not 2 <= points <= MAX_REPLICAS or (name == "timestep" and min(ends) <= 0):
+    if (
+        not np.isfinite(ends).all()
+        or not 2 <= points <= MAX_REPLICAS
+        or (name == "timestep" and min(ends) <= 0)
+    ):
         raise ValueError(text)
     series = np.geomspace if name == "timestep" else np.linspace
     return tuple(map(rounded, series(*ends, points).tolist()))

@@ -5,7 +5,7 @@ import shlex
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ from jaxgran.cli.terminal import (
     say_written,
     stop,
 )
+from jaxgran.files import stamp
 from jaxgran.maps.interruption import Interrupted, is_interruption
 from jaxgran.maps.settings import OPTIONS
 from jaxgran.model.display import counted
@@ -49,7 +50,7 @@ def run_map(parameters: Mapping[str, Any], quiet: bool) -> Outcome:
         **_numerics(parameters),
     }
     output = given.get("output")
-    before, interrupted = _stamp(output), False
+    before, interrupted = stamp(output), False
     with warnings.catch_warnings():
         warnings.showwarning = lambda warning, *_, **__: say(f"{warning}")
         warnings.simplefilter("always", UserWarning, append=True)  # after the filters of a command
@@ -59,17 +60,19 @@ def run_map(parameters: Mapping[str, Any], quiet: bool) -> Outcome:
                 data = ratio_map(**given)
             except Interrupted as interruption:
                 data, interrupted = interruption.data, True
-    return Outcome(data, interrupted, _stamp(output) != before)
+    return Outcome(data, interrupted, stamp(output) != before)
 
 
 @contextmanager
 def told_how_to_resume(output: Path | None, finished: bool = False) -> Iterator[None]:
     """An interruption of the block ends the command, and says what is saved and how to go on."""
+    before = stamp(output)
     try:
         yield
     except BaseException as error:
         if not is_interruption(error):
             raise
+        finished = finished or stamp(output) != before
         stop(f"interrupted; {_saved(output, finished, finished)}", interrupted_status())
 
 
@@ -95,14 +98,6 @@ def command_line() -> str:
     return os.fsencode(shlex.join(["jaxgran", *sys.argv[1:]])).decode(errors="backslashreplace")
 
 
-def _stamp(path: Path | None) -> tuple[int, int] | None:
-    """What changes when a file is replaced; None if there is none."""
-    with suppress(OSError, TypeError):
-        status = os.stat(path)  # type: ignore[arg-type]
-        return status.st_ino, status.st_mtime_ns
-    return None
-
-
 def _say_errors(data) -> None:
     """Print the largest relative error beside the requested one, and the sampled strains."""
     from jaxgran.sampling.sample import ERROR_OBSERVABLES
@@ -124,7 +119,12 @@ def _say_errors(data) -> None:
 
 
 def finish(
-    data, written: list[Path], interrupted: bool, quiet: bool = False, output: Path | None = None
+    data,
+    written: list[Path],
+    interrupted: bool,
+    quiet: bool = False,
+    output: Path | None = None,
+    saved: str = "",
 ) -> None:
     """Print what was written, unless quiet, and what went wrong; exit with the matching status.
 
@@ -140,12 +140,9 @@ def finish(
     if short:
         say(with_options(short_samples_message(data, short), OPTIONS))
     if interrupted:
-        missing = (
-            ""
-            if data.status.size == 1
-            else f" with {counted(len(bad.get('not_run', [])), 'point')} missing"
-        )
-        saved = _saved(output, bool(written))
+        lost = len(bad.get("not_run", []))
+        missing = f" with {counted(lost, 'point')} missing" if lost and data.status.size > 1 else ""
+        saved = saved or _saved(output, bool(written))
         say(f"jaxgran: interrupted{missing}; {saved}")
         raise SystemExit(interrupted_status())
     if bad:

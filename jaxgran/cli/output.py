@@ -146,8 +146,15 @@ class Entry(NamedTuple):
     ci95_by_source: Any = None
 
 
+class JsonObject:
+    """Whether the object that ``--json`` asks for has been printed."""
+
+    printed = False
+
+
 def print_json(entries: Mapping[str, Entry]) -> None:
     """Print the entries on standard output."""
+    JsonObject.printed = True
     always = ("value", "stderr", "ci95", "unit", "meaning")
     plain = {
         name: {

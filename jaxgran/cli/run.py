@@ -1,5 +1,7 @@
 """The command ``run``: one flow, its averages, and its frames as a trajectory or movie."""
 
+import os
+import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -78,13 +80,16 @@ def simulate_flow(
     if files:
         chosen = _recorded(files, chosen)
         strain = chosen.get("strain", _RECORDED_STRAIN)
+        if trajectory is not None:  # so that recordings of one name do not meet
+            unique = f"{trajectory.name}.unfinished-{secrets.token_hex(4)}"
+            files["unfinished"] = trajectory.with_name(unique)
         recorder, film = _recorder(files, strain, frame_strain, force_strain)
         record = recorder.recording
     elif frame_strain is not None or force_strain is not None:
         name = "force_strain" if frame_strain is None else "frame_strain"
         raise InputError(f"`{name}` requires `trajectory` or `movie`.", field=name)
     plane = {"restitution": (restitution,), "packing_fraction": (packing_fraction,)}
-    with _complete_at_the_end(trajectory):
+    with _complete_at_the_end(files, bool(given.get("overwrite"))):
         data, interrupted, written = run_map({**plane, **chosen, "record": record}, quiet)
     if not json:
         print_flow(data, all)
@@ -93,31 +98,33 @@ def simulate_flow(
     if json:
         print_json(summary_of(data.isel(packing_fraction=0, restitution=0)))
     output = chosen.get("output")
-    finish(data, [output] if output is not None and written else [], interrupted, quiet, output)
+    saved = "the frames until then are saved." if recorder is not None and recorder.frames else ""
+    written = [output] if output is not None and written else []
+    finish(data, written, interrupted, quiet, output, saved)
 
 
 run_command = command(RUN_OPTIONS, simulate_flow, required=("restitution", "packing_fraction"))
 
 
-def _unfinished(trajectory: Path) -> Path:
-    """The name of a trajectory to which frames are appended."""
-    return trajectory.with_name(f"{trajectory.name}.unfinished")
-
-
 @contextmanager
-def _complete_at_the_end(trajectory: Path | None) -> Iterator[None]:
+def _complete_at_the_end(files: Mapping[str, Path], overwrite: bool) -> Iterator[None]:
     """A trajectory that the block has recorded gets its own name, also after an interruption; an
     error, such as that of a full disk, leaves none.
     """
+    unfinished = files.get("unfinished")
     try:
         yield
     except Exception:
-        if trajectory is not None:
-            _unfinished(trajectory).unlink(missing_ok=True)
+        if unfinished is not None:
+            unfinished.unlink(missing_ok=True)
         raise
     finally:
-        if trajectory is not None and _unfinished(trajectory).exists():
-            _unfinished(trajectory).replace(trajectory)
+        if unfinished is not None and unfinished.exists():
+            if not overwrite:
+                require_absent(
+                    files["trajectory"], "trajectory", f"the frames are in {unfinished}; "
+                )
+            unfinished.replace(os.path.realpath(files["trajectory"]))
 
 
 def _recorded(files: Mapping[str, Path], chosen: Mapping[str, Any]) -> dict[str, Any]:
@@ -128,6 +135,8 @@ def _recorded(files: Mapping[str, Path], chosen: Mapping[str, Any]) -> dict[str,
     for name in (name for name, true in several.items() if true):
         reason = f"`trajectory` and `movie` show one flow of one seed: leave out `{name}`."
         raise InputError(reason, field=name)
+    if chosen.get("resume"):
+        raise InputError("`trajectory` and `movie` exclude `resume`.", field="resume")
     if not chosen.get("overwrite"):
         for name, file in files.items():
             require_absent(file, name)
@@ -160,7 +169,7 @@ def _recorder(
     keep, film = [], Frames()
     if "trajectory" in files:
         check_trajectory(files["trajectory"])
-        keep.append(partial(write_frame, _unfinished(files["trajectory"])))
+        keep.append(partial(write_frame, files["unfinished"]))
     if "movie" in files:
         check_movie(files["movie"])
         keep.append(film.keep)
@@ -177,8 +186,9 @@ def _write_frames(files: Mapping[str, Path], recorder: Any, film: Any, quiet: bo
         write_movie(files["movie"], film, follow=iter if quiet else with_progress)
     if not quiet:
         say("recording splits the run at different steps: averages change within their errors.")
-        for name, file in files.items():
-            count = recorder.frames if name == "trajectory" else len(film)
-            say(f"wrote {file}: {counted(count, 'frame')}")
+        counts = {"trajectory": recorder.frames, "movie": len(film)}
+        for name, count in counts.items():
+            if name in files:
+                say(f"wrote {files[name]}: {counted(count, 'frame')}")
     if recorder.status > 0:
         say(lost_forces(recorder.status))

@@ -44,11 +44,16 @@ def summary_of(data: Any) -> dict[str, Entry]:
     """
     from jaxgran.maps.schema import flag_names, flattened, path_of, shear_stress_ratio
     from jaxgran.maps.variables import SCALARS
+    from jaxgran.model.status import GIVEN_UP, Status
     from jaxgran.sampling.enskog_factors import LENGTHS
     from jaxgran.sampling.observables import OBSERVABLES
 
     flat = flattened(data)
-    strain = flat["sums/strain"].sum("seed").values
+    names = flag_names(flat["sums/status"])
+    good = [
+        x for x, name in names.items() if name in Status.__members__ and Status[name] < GIVEN_UP
+    ]
+    strain = flat["sums/strain"].where(flat["sums/status"].isin(good), 0).sum("seed").values
     statuses = np.vectorize(flag_names(flat.status).get)(flat.status.values)
     known: dict[str, Entry] = {}
     for name in ("grains", "timestep", "packing_fraction", "restitution"):
@@ -56,7 +61,7 @@ def summary_of(data: Any) -> dict[str, Entry]:
         unit = axis.attrs.get("reduced_unit", axis.units)
         known[name] = Entry(axis.values, axis.long_name, unit)
     known |= {
-        "strain": Entry(strain, "sampled strain of all seeds"),
+        "strain": Entry(strain, "sampled strain of all seeds that count"),
         "engine": Entry(data.attrs["engine"], "program that advanced the flow", None),
         "solver": Entry(data.attrs["solver"], "method of the contact solve", None),
         "status": Entry(statuses, "worst status", None),

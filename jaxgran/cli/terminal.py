@@ -26,7 +26,7 @@ from typing import Any, NoReturn, TypeVar
 import typer
 
 from jaxgran.cache.folder import cache_folder, fallback_message, use_cache
-from jaxgran.cli.output import Entry, print_json
+from jaxgran.cli.output import Entry, JsonObject, print_json
 from jaxgran.environment import devices
 from jaxgran.maps.interruption import is_interruption
 from jaxgran.model.checks import InputError, short_repr
@@ -67,7 +67,8 @@ def run_command(command: Callable[[], None], sentence: Callable[[Any], str]) -> 
 
 
 def _of_file(error: OSError, sentence: Callable[[Any], str] = str) -> str:
-    notes = "".join(f"; {sentence(note)}" for note in getattr(error, "__notes__", []))
+    ours = (note for note in getattr(error, "__notes__", []) if note[:2] != "--")  # not JAX's
+    notes = "".join(f"; {sentence(note)}" for note in ours)
     file = "" if error.filename is None else f": {short_repr(str(error.filename))}"
     cause = ":" if isinstance(error, ConnectionError) else " by the file system,"
     return f"stopped{cause} {error.strerror or error}{file}{notes}."
@@ -75,6 +76,7 @@ def _of_file(error: OSError, sentence: Callable[[Any], str] = str) -> str:
 
 def exit_status(app: Callable[..., Any]) -> int:
     """Run the program, and return its exit status."""
+    JsonObject.printed = False
     try:
         return app(prog_name="jaxgran", standalone_mode=False) or 0
     except _UsageError as mistake:
@@ -148,7 +150,7 @@ def stop(sentence: str, status: int = INPUT_MISTAKE) -> NoReturn:
 
 def _print_json_error(sentence: str) -> None:
     """Print an error as the object that was asked for."""
-    if "--json" in sys.argv:
+    if "--json" in sys.argv and not JsonObject.printed:
         with suppress(OSError):  # it is the reason why there is no result
             print_json({"error": Entry(sentence, "why there is no result", None)})
 

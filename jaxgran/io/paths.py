@@ -19,19 +19,21 @@ def as_path(name: str, value: Any) -> Path:
 
 def require_place(path: Path, option: str, ending: str) -> None:
     """Raise an InputError unless a file with this suffix can be written to ``path``."""
-    name, folder = short_repr(str(path)), short_repr(str(path.parent))
+    name = short_repr(str(path))
     if path.suffix != ending:
         raise refused(option, str(path), f"must be a file name that ends in {ending}")
     if len(os.fsencode(path.name)) > _LONGEST_NAME:
         raise refused(option, path.name, f"must be a file name of at most {_LONGEST_NAME} bytes")
     if os.path.isdir(path):
         raise InputError(f"{option} must be a file, and {name} is a folder.", field=option)
-    if not os.path.isdir(path.parent):
+    parent = Path(os.path.realpath(path)).parent if path.is_symlink() else path.parent
+    if not os.path.isdir(parent):
         raise InputError(
-            f"{option} must be in a folder that exists, and {folder} does not.", field=option
+            f"{option} must be in a folder that exists, and {short_repr(str(parent))} does not.",
+            field=option,
         )
     try:
-        with tempfile.TemporaryFile(dir=path.parent):
+        with tempfile.TemporaryFile(dir=parent):
             pass
         if path.exists():
             with path.open("ab"):
@@ -44,11 +46,11 @@ def require_place(path: Path, option: str, ending: str) -> None:
         ) from None
 
 
-def require_absent(path: Path, option: str) -> None:
+def require_absent(path: Path, option: str, kept: str = "") -> None:
     """Raise an InputError if there is a file that would be replaced."""
     if os.path.isfile(path):
         raise InputError(
-            f"{option} {short_repr(str(path))} already exists; name another file, or pass "
+            f"{option} {short_repr(str(path))} already exists; {kept}name another file, or pass "
             "`overwrite=True` to replace it.",
             field=option,
         )

@@ -109,7 +109,7 @@ class Meter:
         seconds, done = time.perf_counter() - self.start, self._cost_of_run
         points = sum(seeds == 0 for seeds in self.left.values())
         percent = 100 * (self.resumed_cost + done) / self.total
-        whole = self.total - self.resumed_cost
+        whole = max(self.total - self.resumed_cost, 0.0)
         if done > _LEAST_DONE * whole:
             time_left = duration(seconds * max(whole - done, 0.0) / done)
         elif math.isinf(self.seconds):

@@ -198,8 +198,9 @@ def check_run(run: RunOptions) -> None:
         require_whole("workers", run.workers, 1, _MOST_WORKERS)
     if not isinstance(run.progress, bool) and not callable(run.progress):
         raise refused("progress", run.progress, "must be True, False or a function of one number")
-    if run.scheduler is not None and not isinstance(run.scheduler, str):
-        raise refused("scheduler", run.scheduler, "must be an address")
+    if run.scheduler is not None and ":" not in str(run.scheduler):
+        reason = "must be an address such as tcp://127.0.0.1:8786"
+        raise refused("scheduler", run.scheduler, reason)
     several = run.workers is not None and run.workers > 1
     if run.scheduler is not None and several:
         raise InputError("`scheduler` and `workers` exclude each other.", field="scheduler")

@@ -55,6 +55,8 @@ def combined(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, An
     if "grains_by_point" in kept and _OF_POINTS & given.keys():
         del kept["grains_by_point"]
         kept["grains"] = "auto"  # chosen again, for the points that are given
+    if _OF_POINTS & given.keys():
+        kept.pop("part", None)  # a part of other points
     implied = _OF_ERROR if "error" in given else {}
     return kept | implied | dict(given)
 

@@ -20,9 +20,8 @@ and its replicas are computed again.
 import glob
 import json
 import os
-import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ import xarray as xr
 
 from jaxgran.dynamics.tally import TABLE
 from jaxgran.environment import default_device, precision
-from jaxgran.files import atomic_write, is_locked, lock_file
+from jaxgran.files import atomic_write, is_locked, lock_file, stamp
 from jaxgran.io.arrays import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps import results
 from jaxgran.maps.attributes import common_identity, digest, first_difference, from_attrs, identity
@@ -70,6 +69,7 @@ class Store:
         self.output, self.settings = output, settings
         self.folder = output.with_name(f"{output.name}.unfinished")
         self.damaged: list[str] = []
+        self._overwrite, self._stamp = overwrite, stamp(output)
         self._lock_path, self._begun_path = self.folder / "lock", self.folder / "settings.json"
         self._ids = set(replica_ids(settings))
         self._made, self._of_map = made_with(), identity(settings)
@@ -123,6 +123,9 @@ class Store:
         lacks.
         """
         if "tally" in data["sums"] and not (interrupted and self.in_file - self.replicas.keys()):
+            if not self._overwrite and stamp(self.output) != self._stamp:
+                kept = "the replicas of this one are kept in its folder; "
+                raise self._refused("what another process wrote meanwhile", kept)
             results.write_dataset(data, self.output)
 
     def close(self, written: bool = False) -> None:
@@ -133,11 +136,16 @@ class Store:
             whole = written and self._ids <= self.replicas.keys()
             own = {self._path(x) for x in self._ids} if whole else set()
             blocks = [] if whole else self.folder.glob(f"blocks-*-{self._digest}.npz")
-            if not {*self.folder.glob("replica-*.npz"), *blocks} - own:
+            empty = not {*self.folder.glob("replica-*.npz"), *blocks} - own
+            if empty:
                 self._begun_path.unlink(missing_ok=True)  # first: without it there is no map
-                shutil.rmtree(self.folder, ignore_errors=True)
             for path in own:
                 path.unlink(missing_ok=True)
+            if empty:
+                for path in (*self.folder.glob("blocks-*.npz"), self._lock_path):
+                    path.unlink(missing_ok=True)
+                with suppress(OSError):  # files of the user are in it
+                    self.folder.rmdir()
         self._unlock()
 
     def _earlier_map(self, resume: bool, overwrite: bool) -> xr.DataTree | None:
@@ -150,9 +158,11 @@ class Store:
                 raise self._refused("something other than a map of this version") from None
             return None
         difference = first_difference(there, self._of_map)
-        same = common_identity(there) == common_identity(self._of_map)
+        common = first_difference(common_identity(there), common_identity(self._of_map))
+        same = common is None
         if resume and same:
             return self._of_same_code(data, overwrite)
+        difference = common if resume else difference
         if overwrite:
             return None
         if difference is not None:
@@ -205,13 +215,18 @@ class Store:
         begun: dict[str, Any] = {}
         try:
             if self._begun_path.exists():
-                begun = json.loads(self._begun_path.read_text("utf-8"))
-        except ValueError:
+                begun = dict(json.loads(self._begun_path.read_text("utf-8")))
+        except (TypeError, ValueError):
             raise InputError(
                 f"the file settings.json in {str(self.folder)!r} is damaged: remove the folder."
             ) from None
         commit = {"commit": begun.pop("commit", "")}
         blocks = self.folder.glob(f"blocks-*-{digest(begun)}.npz")
+        if not begun and not self.output.exists() and [*self.folder.glob("replica-*.npz")]:
+            raise InputError(
+                f"the folder {str(self.folder)!r} has replicas, and no settings.json that says of "
+                "which map: rename or remove it."
+            )
         if not begun or not [*self.folder.glob("replica-*.npz"), *blocks]:
             for path in self.folder.glob("*.npz"):
                 path.unlink()
