@@ -86,7 +86,23 @@ def compare() -> None:
     writes.clear()
 
 
+def fill_the_room() -> None:
+    """More indices are wanted than there is room for; no lane may write beyond it."""
+    for module in (lanes, contacts):
+        module.sync = lambda: None
+    alone = lanes.Team(0, 1, np.zeros(1, np.int64), np.zeros(1))
+    written = np.zeros(3, np.int64)
+    try:
+        found = contacts.indices_of(alone, np.ones(5), 1, 5, written, 1)
+    except IndexError as problem:
+        wrong.add(f"beyond the room: {problem}")
+    else:
+        if found != 5 or written.tolist() != [0, 0, 1]:
+            wrong.add(f"{found} indices are found and {written} written")
+
+
 def main(file: str, count_of_lanes: int, without: str = "") -> None:
+    fill_the_room()
     given = np.load(file)
     meeting = threading.Barrier(count_of_lanes, action=compare)
 

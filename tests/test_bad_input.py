@@ -325,6 +325,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "no total momentum": lambda: sheared(velocities=np.ones((GRAINS, 2))),
     "0.6, which the state has": lambda: jg.sample(DILUTE, SEEN.state, 1.0),
     "its numbers are float32 and float64": lambda: sheared(tilt=np.float32(0)),
+    "blocks must be at most 1000000": lambda: jg.sample(flow(), SEEN.state, 1.0, 10**6 + 1),
     "velocities are of the type list": lambda: sheared(velocities=PLACES[0].tolist()),
     "steps must be one number": lambda: jg.count_events(flow(), SEEN.state, np.array([5, 5])),
     "at least 1.6e-05 / shear_rate": lambda: jg.snapshot_series(
