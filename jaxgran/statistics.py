@@ -165,7 +165,7 @@ def _influences(
     def whole_and_parts(x: np.ndarray) -> np.ndarray:
         parts = _joined(x, counts)
         whole = parts.sum(axis=0)[None]
-        return np.concatenate([whole, whole - parts]) if total > 1 else whole  # then without each
+        return np.concatenate([whole, whole - parts]) if total > 1 else whole  # then all but each
 
     flat, by_name = _flat(estimate(jax.tree.map(whole_and_parts, sums)))
     without = flat[1:].astype(float) if total > 1 else np.full(flat.shape, np.nan)

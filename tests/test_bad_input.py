@@ -326,7 +326,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "0.6, which the state has": lambda: jg.sample(DILUTE, SEEN.state, 1.0),
     "its numbers are float32 and float64": lambda: sheared(tilt=np.float32(0)),
     "blocks must be at most 1000000": lambda: jg.sample(flow(), SEEN.state, 1.0, 10**6 + 1),
-    "velocities are of the type list": lambda: sheared(velocities=PLACES[0].tolist()),
+    "velocities has the type list": lambda: sheared(velocities=PLACES[0].tolist()),
     "steps must be one number": lambda: jg.count_events(flow(), SEEN.state, np.array([5, 5])),
     "at least 1.6e-05 / shear_rate": lambda: jg.snapshot_series(
         make_flow("timestep", 1e-7), SINGLE, 1e-3, 4
@@ -394,10 +394,10 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "seen must be a flow of finite": lambda: jg.flow_figure(replace(SEEN, state=LOST)),
     "there is no file": lambda: jg.read_trajectory("none.gsd"),
     # theories and the law
-    "packing_fraction must be above 0 and below 1": lambda: gaussian_moments(0.5, 1.2),
-    "restitution must be between 0 and 1, not 1.5": lambda: garzo_dufty(1.5, 0.6),
-    "restitution must be between 0 and 1, not -0.5": lambda: corrected_shear(-0.5, 0.6),
-    "polydispersity must be at least 0 and below": lambda: gaussian_moments(0.5, 0.6, 1.0, 1.5),
+    "packing_fraction must be a number above 0": lambda: gaussian_moments(0.5, 1.2),
+    "restitution must be a number between 0 and 1, not 1.5": lambda: garzo_dufty(1.5, 0.6),
+    "restitution must be a number between 0 and 1, not -0.5": lambda: corrected_shear(-0.5, 0.6),
+    "polydispersity must be a number of at least 0": lambda: gaussian_moments(0.5, 0.6, 1.0, 1.5),
     "temperature must be a tensor (2, 2)": lambda: collisional_transfer(np.ones(4), 0.5, 0.6),
     "shape that broadcasts with those of": lambda: LAW([0.5, 0.6], 0.6, [1.0, 2.0, 3.0]),
     "the reference map, not [0.5, None]": lambda: LAW(np.ma.array([0.5, 1], mask=[0, 1]), 0.6),

@@ -31,7 +31,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from PIL import Image
-from synthetic import one_sentence, random_replica, refused
+from synthetic import one_sentence, random_replica
 
 from jaxgran.cli import app, options
 from jaxgran.cli import map as map_module
@@ -496,12 +496,12 @@ def test_a_recording_touches_no_frames_but_its_own(tmp_path: Path) -> None:
         own.write_bytes(b"frames")
         raise OSError
     assert files(tmp_path) == {of_another.name}
-    meanwhile = refused("the frames are in .*unfinished-1")
-    with meanwhile, _complete_at_the_end(recorded, overwrite=False):
+    with _complete_at_the_end(recorded, overwrite=False):
         own.write_bytes(b"frames")
         trajectory.write_bytes(b"written meanwhile")
+    assert recorded.pop("trajectory") == own
     assert trajectory.read_bytes() == b"written meanwhile" and own.read_bytes() == b"frames"
-    with _complete_at_the_end(recorded, overwrite=True):
+    with _complete_at_the_end(recorded | {"trajectory": trajectory}, overwrite=True):
         pass
     assert trajectory.read_bytes() == b"frames" and not own.exists()
     assert of_another.read_bytes() == b"frames of another"

@@ -119,6 +119,10 @@ def test_solution_does_not_depend_on_the_unit_of_speed(speed, kind):
     impulses = np.asarray(solution.impulses, float) / float(-row.approach[0])
     np.testing.assert_allclose(impulses, [4 / 3, 2 / 3], rtol=1e-5)
     assert solution.status == Status.ok and solution.residual < 1e-6
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        changes = jacobian(lambda u: solve_contacts(replace(row, approach=u), 1.0).impulses)
+        expected = [[-4 / 3, -2 / 3], [-2 / 3, -4 / 3]]
+        np.testing.assert_allclose(changes(row.approach), expected, rtol=2e-3)
     apart = replace(row, approach=np.array([0, speed], kind))
     stuck = contact_residual(apart, np.array([0.5 * speed, 0], kind))
     np.testing.assert_allclose(stuck, speed, rtol=1e-2)

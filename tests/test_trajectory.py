@@ -153,7 +153,7 @@ def test_frames_that_contradict_flow_grains_or_strain_are_refused(
     }.items():
         with refused(words):
             write_trajectory(tmp_path / "flow.gsd", *given)
-    with jax.enable_x64(False), refused("precision of JAX, which is now float32"):
+    with jax.enable_x64(False), refused("precision in which JAX computes, float32"):
         write_trajectory(tmp_path / "flow.gsd", flow, jax.tree.map(np.asarray, states), strains)
     assert not list(tmp_path.iterdir())
 

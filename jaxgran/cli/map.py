@@ -100,13 +100,14 @@ def draw_beside(
     """Draw the figures of a map beside its file, none of a part. Of a map that was there before,
     remove the others with ``overwrite``, or else name them.
 
-    Figures that are there are kept if the file was not ``written``, and they are newer. The files
-    drawn.
+    Figures that are there are kept if the file was not ``written``, and none of them is older than
+    it. The files drawn.
     """
     from jaxgran.plotting.map_figures import pictures_beside, save_figures
 
     stem, made = output.with_suffix(""), os.stat(output).st_mtime_ns if existed else 0
-    old = any(file.stat().st_mtime_ns < made for file in pictures_beside(output))
+    drawn = (file for file in pictures_beside(output) if file.suffix == f".{format}")
+    old = any(file.stat().st_mtime_ns < made for file in drawn)
     renew = overwrite or written or old
     pictures = [] if data is None else save_figures(data, stem, format, overwrite=renew)
     if renew and existed:

@@ -78,7 +78,7 @@ def told_how_to_resume(output: Path | None, finished: bool = False) -> Iterator[
 
 def _saved(output: Path | None, written: bool, finished: bool = False) -> str:
     """What an interruption left, and the command that continues from it, if one does."""
-    if output is not None and (finished or os.path.isdir(f"{output}.unfinished")):
+    if output is not None and (finished or os.path.isfile(f"{output}.unfinished/settings.json")):
         resume = "" if "--resume" in sys.argv else " --resume"
         return f"finished points are saved. Continue: {command_line()}{resume}"
     return "finished points are saved." if written else "nothing is saved."
@@ -128,7 +128,8 @@ def finish(
 ) -> None:
     """Print what was written, unless quiet, and what went wrong; exit with the matching status.
 
-    A map that was interrupted goes on from the folder beside its output, if there is one.
+    A map that was interrupted goes on from the folder beside its output, if there is one; ``saved``
+    says what else an interruption left.
     """
     from jaxgran.maps.status_report import bad_points, bad_points_message, short_samples_message
 

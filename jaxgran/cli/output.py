@@ -154,7 +154,6 @@ class JsonObject:
 
 def print_json(entries: Mapping[str, Entry]) -> None:
     """Print the entries on standard output."""
-    JsonObject.printed = True
     always = ("value", "stderr", "ci95", "unit", "meaning")
     plain = {
         name: {
@@ -164,7 +163,9 @@ def print_json(entries: Mapping[str, Entry]) -> None:
         }
         for name, entry in entries.items()
     }
-    print(json.dumps(plain, indent=2, allow_nan=False))
+    text = json.dumps(plain, indent=2, allow_nan=False)
+    JsonObject.printed = True
+    print(text)
 
 
 def _plain(value: Any) -> Any:

@@ -82,7 +82,7 @@ def simulate_flow(
         strain = chosen.get("strain", _RECORDED_STRAIN)
         if trajectory is not None:  # so that recordings of one name do not meet
             unique = f"{trajectory.name}.unfinished-{secrets.token_hex(4)}"
-            files["unfinished"] = trajectory.with_name(unique)
+            files["unfinished"] = Path(os.path.realpath(trajectory)).with_name(unique)
         recorder, film = _recorder(files, strain, frame_strain, force_strain)
         record = recorder.recording
     elif frame_strain is not None or force_strain is not None:
@@ -107,24 +107,26 @@ run_command = command(RUN_OPTIONS, simulate_flow, required=("restitution", "pack
 
 
 @contextmanager
-def _complete_at_the_end(files: Mapping[str, Path], overwrite: bool) -> Iterator[None]:
-    """A trajectory that the block has recorded gets its own name, also after an interruption; an
-    error, such as that of a full disk, leaves none.
+def _complete_at_the_end(files: dict[str, Path], overwrite: bool) -> Iterator[None]:
+    """A trajectory that the block has recorded gets its own name, also after an interruption; where
+    another process has taken this name meanwhile, it keeps its own. An error of the file system,
+    such as that of a full disk, leaves none.
     """
     unfinished = files.get("unfinished")
     try:
         yield
-    except Exception:
+    except OSError:
         if unfinished is not None:
             unfinished.unlink(missing_ok=True)
         raise
     finally:
         if unfinished is not None and unfinished.exists():
-            if not overwrite:
-                require_absent(
-                    files["trajectory"], "trajectory", f"the frames are in {unfinished}; "
-                )
-            unfinished.replace(os.path.realpath(files["trajectory"]))
+            taken = not overwrite and os.path.isfile(files["trajectory"])
+            if taken:
+                say(f"another process has written {files['trajectory']} meanwhile.")
+                files["trajectory"] = unfinished
+            else:
+                unfinished.replace(os.path.realpath(files["trajectory"]))
 
 
 def _recorded(files: Mapping[str, Path], chosen: Mapping[str, Any]) -> dict[str, Any]:

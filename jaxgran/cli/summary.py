@@ -61,7 +61,7 @@ def summary_of(data: Any) -> dict[str, Entry]:
         unit = axis.attrs.get("reduced_unit", axis.units)
         known[name] = Entry(axis.values, axis.long_name, unit)
     known |= {
-        "strain": Entry(strain, "sampled strain of all seeds that count"),
+        "strain": Entry(strain, "sampled strain of the seeds in the averages"),
         "engine": Entry(data.attrs["engine"], "program that advanced the flow", None),
         "solver": Entry(data.attrs["solver"], "method of the contact solve", None),
         "status": Entry(statuses, "worst status", None),

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.problem import ContactProblem, as_problem, check_problem, require_shape
 from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod, dot, require_solver
-from jaxgran.contact.solver import natural_map, solve
+from jaxgran.contact.solver import natural_map, solve, unit_of
 from jaxgran.model.checks import as_array, require_number
 from jaxgran.model.flow import RANGES
 from jaxgran.model.values import Value
@@ -146,7 +146,7 @@ def _of_precision(kind: Any, number: Any) -> Array:
 def _solved(
     problem: ContactProblem, restitution: Array, solver: ProjectedMethod
 ) -> ContactSolution:
-    unit = _speed_of(problem)
+    unit = unit_of(problem.approach)
     scaled = replace(problem, approach=problem.approach / unit)
     operator = scaled.operator()
     fastest = lax.stop_gradient(jnp.max(jnp.abs(operator.approach)))
@@ -163,7 +163,7 @@ def _solved(
 
 @jax.jit
 def _residual(problem: ContactProblem, impulses: Array, restitution: Array) -> Float[Array, ""]:
-    unit = _speed_of(problem)
+    unit = unit_of(problem.approach)
     operator = replace(problem, approach=problem.approach / unit).operator()
     impulses = impulses / unit
     after = operator.product(impulses) + (1 + restitution) * operator.approach
@@ -171,12 +171,3 @@ def _residual(problem: ContactProblem, impulses: Array, restitution: Array) -> F
     speed = jnp.sqrt(dot(stopped, stopped))
     residual = natural_map(operator.diagonal(), impulses, after)
     return lax.stop_gradient(residual / jnp.where(speed > 0, speed, 1 / unit))
-
-
-def _speed_of(problem: ContactProblem) -> Float[Array, ""]:
-    """A power of two near the largest speed, in which no square over- or underflows; division by it
-    is exact.
-    """
-    fastest = lax.stop_gradient(jnp.max(jnp.abs(problem.approach)))
-    exponent = jnp.frexp(jnp.where((fastest > 0) & jnp.isfinite(fastest), fastest, 1))[1]
-    return jnp.ldexp(jnp.ones((), fastest.dtype), exponent - 1)

@@ -63,6 +63,15 @@ def natural_map(
     return jnp.sqrt(dot(error, error))
 
 
+def unit_of(values: Float[Array, " contacts"]) -> Float[Array, ""]:
+    """A power of two near the largest of some values, in which no square of them over- or
+    underflows; division by it is exact.
+    """
+    largest = lax.stop_gradient(jnp.max(jnp.abs(values)))
+    exponent = jnp.frexp(jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1))[1]
+    return jnp.ldexp(jnp.ones((), largest.dtype), exponent - 1)
+
+
 @jax.custom_jvp
 def solve(
     operator: DelassusOperator, shear_rate: float | Array, solver: ProjectedMethod, active: Array
@@ -149,6 +158,8 @@ def _solve_jvp(primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
         return jnp.where(loaded, operator.product(jnp.where(loaded, x, 0)), x)
 
     def by_conjugate_gradients(matvec: Callable, target: Array) -> Array:
+        unit = unit_of(target)
+        target = target / unit
         square = dot(target, target)
 
         def unfinished(now: _Gradients) -> Array:
@@ -178,7 +189,7 @@ def _solve_jvp(primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
         x = lax.while_loop(unfinished, iterate, start).best
         residual = target - matvec(x)
         converged = dot(residual, residual) <= _WORST_DERIVATIVE**2 * square
-        return jnp.where(converged, x, jnp.nan)
+        return jnp.where(converged & jnp.isfinite(square), unit * x, jnp.nan)
 
     _, response_change = jax.jvp(lambda w: w.product(impulses), (operator,), (change,))
     target = jnp.where(loaded, -(response_change + change.approach), 0)

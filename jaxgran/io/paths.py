@@ -46,11 +46,11 @@ def require_place(path: Path, option: str, ending: str) -> None:
         ) from None
 
 
-def require_absent(path: Path, option: str, kept: str = "") -> None:
+def require_absent(path: Path, option: str) -> None:
     """Raise an InputError if there is a file that would be replaced."""
     if os.path.isfile(path):
         raise InputError(
-            f"{option} {short_repr(str(path))} already exists; {kept}name another file, or pass "
+            f"{option} {short_repr(str(path))} already exists; name another file, or pass "
             "`overwrite=True` to replace it.",
             field=option,
         )

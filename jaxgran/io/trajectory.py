@@ -45,7 +45,6 @@ from typing import Any
 import gsd.fl
 import gsd.hoomd
 import numpy as np
-from jax.dtypes import canonicalize_dtype
 from jaxtyping import Float, Int
 
 from jaxgran.analysis.contacts import pair_forces
@@ -218,11 +217,6 @@ def _steps_of_frames(flow: ShearFlow, states: State, strains: np.ndarray) -> lis
             raise InputError(
                 f"states must have the same grains, and state {number} has others than the first."
             )
-    if canonicalize_dtype(states.positions.dtype) != states.positions.dtype:
-        raise InputError(
-            "states must be in the precision of JAX, which is now float32: turn on float64 "
-            '(jax.config.update("jax_enable_x64", True)).'
-        )
     if strains.shape != (len(states),):
         raise InputError(f"strain must have one number for each of the {len(states)} states.")
     require_sheared(flow)

@@ -15,7 +15,7 @@ AXES = ("grains", "timestep", "packing_fraction", "restitution")
 """The axes of a map, outermost first."""
 
 FURTHER, PLANE = AXES[:2], AXES[2:]
-"""Those that are dimensions of the maps that have several of them, and of all maps."""
+"""Axes that are dimensions only of maps with several values, and those of every map."""
 
 
 class Point(NamedTuple):

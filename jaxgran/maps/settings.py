@@ -283,7 +283,8 @@ class RunOptions:
     )
     from_map: str | os.PathLike | None = option(
         None,
-        "Repeat the map of this file, but for the parameters that are given.",
+        "Repeat the map of this file, but for the parameters that are given; with other "
+        "restitutions or packing fractions the whole of it.",
         Path,
         commands=("map",),
         example="FILE.nc",

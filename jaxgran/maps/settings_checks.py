@@ -23,7 +23,7 @@ from jaxgran.model.checks import (
     InputError,
     refused,
     require_flag,
-    require_function,
+    require_hashable,
     require_number,
     require_whole,
     short_repr,
@@ -143,7 +143,7 @@ def _check_observe(observe: Any, flow: ShearFlow) -> None:
     if not callable(observe):
         reason = "must be a function that is passed to `ratio_map`, or None"
         raise refused("observe", observe, reason)
-    require_function("observe", observe)
+    require_hashable("observe", observe)
     shapes = observed_shapes(observe, flow)
     names = list(shapes) if isinstance(shapes, dict) else []
     if not names or not all(isinstance(x, jax.ShapeDtypeStruct) for x in shapes.values()):
@@ -198,7 +198,8 @@ def check_run(run: RunOptions) -> None:
         require_whole("workers", run.workers, 1, _MOST_WORKERS)
     if not isinstance(run.progress, bool) and not callable(run.progress):
         raise refused("progress", run.progress, "must be True, False or a function of one number")
-    if run.scheduler is not None and ":" not in str(run.scheduler):
+    known = run.scheduler is None or isinstance(run.scheduler, str)
+    if not known or ":" not in (run.scheduler or ":"):
         reason = "must be an address such as tcp://127.0.0.1:8786"
         raise refused("scheduler", run.scheduler, reason)
     several = run.workers is not None and run.workers > 1

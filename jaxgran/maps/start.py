@@ -24,7 +24,7 @@ _REPLACED = {
 _OF_POINTS = {"grains", "timestep", "restitution", "packing_fraction", "error"}
 _OF_ERROR = {"grains": "auto", "timestep": "auto", "seeds": 1}
 """What an error implies; a longer sample is cheaper than a second seed."""
-_COMPARED = ("device", "precision", "commit", "code_digest")  # of two runs, and the versions
+_COMPARED = ("device", "precision", "commit", "code_digest")  # and all versions
 
 
 def with_start(
@@ -55,8 +55,8 @@ def combined(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, An
     if "grains_by_point" in kept and _OF_POINTS & given.keys():
         del kept["grains_by_point"]
         kept["grains"] = "auto"  # chosen again, for the points that are given
-    if _OF_POINTS & given.keys():
-        kept.pop("part", None)  # a part of other points
+    if {"restitution", "packing_fraction"} & given.keys():
+        kept.pop("part", None)  # it is one of other points
     implied = _OF_ERROR if "error" in given else {}
     return kept | implied | dict(given)
 

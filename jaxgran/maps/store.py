@@ -20,6 +20,7 @@ and its replicas are computed again.
 import glob
 import json
 import os
+import secrets
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -69,7 +70,7 @@ class Store:
         self.output, self.settings = output, settings
         self.folder = output.with_name(f"{output.name}.unfinished")
         self.damaged: list[str] = []
-        self._overwrite, self._stamp = overwrite, stamp(output)
+        self._overwrite = overwrite
         self._lock_path, self._begun_path = self.folder / "lock", self.folder / "settings.json"
         self._ids = set(replica_ids(settings))
         self._made, self._of_map = made_with(), identity(settings)
@@ -77,9 +78,10 @@ class Store:
         self._identity = common_identity(self._of_map) | deciding(self._made) | of_device
         self._digest = digest(self._identity)
         self.in_file: set[ReplicaId] = set()
-        earlier = self._earlier_map(resume, overwrite) if output.exists() else None
         self._lock = self._new_lock()
         try:
+            self._stamp = stamp(output)
+            earlier = self._earlier_map(resume, overwrite) if output.exists() else None
             self._remove_leftovers()
             self._begin(resume)
             in_folder = union(self._read() if resume else [])
@@ -123,9 +125,11 @@ class Store:
         lacks.
         """
         if "tally" in data["sums"] and not (interrupted and self.in_file - self.replicas.keys()):
-            if not self._overwrite and stamp(self.output) != self._stamp:
-                kept = "the replicas of this one are kept in its folder; "
-                raise self._refused("what another process wrote meanwhile", kept)
+            if not self._overwrite and stamp(self.output) not in (None, self._stamp):
+                free = self.output.with_name(f"{self.output.stem}-{secrets.token_hex(4)}.nc")
+                results.write_dataset(data, free)
+                where = f"this map is written to {short_repr(str(free))}: "
+                raise self._refused("what another process wrote meanwhile", where)
             results.write_dataset(data, self.output)
 
     def close(self, written: bool = False) -> None:
@@ -158,7 +162,8 @@ class Store:
                 raise self._refused("something other than a map of this version") from None
             return None
         difference = first_difference(there, self._of_map)
-        common = first_difference(common_identity(there), common_identity(self._of_map))
+        theirs, ours = common_identity(there), common_identity(self._of_map)
+        common = first_difference({x: theirs[x] for x in theirs if x in ours}, ours)
         same = common is None
         if resume and same:
             return self._of_same_code(data, overwrite)

@@ -179,11 +179,13 @@ def require_flag(name: str, value: Any) -> None:
 
 
 def require_function(name: str, value: Any) -> None:
-    """Raise an InputError unless the value is a function or None, by which JAX can know a compiled
-    program.
-    """
+    """Raise an InputError unless the value is a function or None."""
     if value is not None and not callable(value):
         raise refused(name, value, "must be a function or None")
+
+
+def require_hashable(name: str, value: Any) -> None:
+    """Raise an InputError unless JAX can tell the program of a function from that of another."""
     try:
         hash(value)
     except TypeError:

@@ -168,7 +168,7 @@ def _require_arrays(grains: int, arrays: dict[str, Any]) -> None:
         shape = (grains, 2) if name in vectors else () if name in numbers else (grains,)
         if not hasattr(x, "dtype") and not isinstance(x, (int, float)):
             raise InputError(
-                f"state must have arrays, and its {name} are of the type {type(x).__name__}: "
+                f"state must have arrays, and its {name} has the type {type(x).__name__}: "
                 "jnp.asarray makes an array of a list."
             )
         if np.shape(x) != shape:

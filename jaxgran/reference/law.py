@@ -158,7 +158,8 @@ class ConstitutiveLaw:
           overwrite: whether a file that is there already is replaced.
 
         Raises:
-          InputError: (a ValueError) a value is outside the measured range, or the file exists.
+          InputError: (a ValueError) a value is outside the measured range, or the file exists or
+            cannot be written.
         """
         path = as_path("path", path)
         require_place(path, "path", path.suffix)

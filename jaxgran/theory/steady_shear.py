@@ -22,10 +22,10 @@ Scalar = float | int | Real[Array, ""]
 T = TypeVar("T")
 
 _RANGES = {
-    "restitution": (lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
-    "packing_fraction": (lambda x: (x > 0) & (x < 1), "above 0 and below 1"),
+    "restitution": (lambda x: (x >= 0) & (x <= 1), "a number between 0 and 1"),
+    "packing_fraction": (lambda x: (x > 0) & (x < 1), "a number above 0 and below 1"),
     "shear_rate": (lambda x: (x >= 0) & (x < np.inf), "a number of at least 0"),
-    "polydispersity": (lambda x: (x >= 0) & (x < 1), "at least 0 and below 1"),
+    "polydispersity": (lambda x: (x >= 0) & (x < 1), "a number of at least 0 and below 1"),
 }
 
 
