@@ -97,6 +97,9 @@ def test_a_range_of_time_steps_has_equal_ratios() -> None:
 FLOW = "run --restitution 0.5 --packing-fraction 0.6"
 MISTAKES = {  # one for each kind of option, check and file
     "map --restitution 0.1:0.9:1": "'--restitution': must be a number or a list",
+    "map --restitution 0.5:inf:3": "'--restitution': must be a number or a list",
+    "map --scheduler 127.0.0.1": "--scheduler must be an address such as tcp://",
+    f"{FLOW} --trajectory flow.gsd --output flow.nc --resume": "--movie exclude --resume",
     "map --grains auto": "--grains auto requires --error",
     f"{FLOW} --timestep abc": "'--timestep': must be auto or a number, not 'abc'",
     f"{FLOW} --seeds 1.5": "'--seeds': must be a whole number, not '1.5'",
