@@ -163,9 +163,10 @@ def _influences(
     total = int(counts.sum())
 
     def whole_and_parts(x: np.ndarray) -> np.ndarray:
+        """The sums, and then those without each part."""
         parts = _joined(x, counts)
         whole = parts.sum(axis=0)[None]
-        return np.concatenate([whole, whole - parts]) if total > 1 else whole  # then all but each
+        return np.concatenate([whole, whole - parts]) if total > 1 else whole
 
     flat, by_name = _flat(estimate(jax.tree.map(whole_and_parts, sums)))
     without = flat[1:].astype(float) if total > 1 else np.full(flat.shape, np.nan)

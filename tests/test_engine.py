@@ -118,6 +118,16 @@ def test_a_number_of_steps_may_be_one_of_python(engine, flowing) -> None:
     assert_same_bits(one, third)
 
 
+def test_a_part_of_a_state_may_be_traced(flowing) -> None:
+    flow, state = of(), flowing(0.7)
+
+    def ends(velocities):
+        return jg.advance(flow, replace(state, velocities=velocities), 20)[0].velocities
+
+    whole = compiled(lambda state: jg.advance(flow, state, 20)[0].velocities)(state)
+    assert_same_bits(compiled(ends)(state.velocities), whole)
+
+
 @pytest.mark.parametrize("numerics", [{"engine": jg.Jax()}, {"solver": jg.Jacobi()}])
 def test_jax_by_name_and_for_another_solver_is_the_plain_advance(numerics, flowing) -> None:
     solver = numerics.get("solver", jg.BarzilaiBorwein())

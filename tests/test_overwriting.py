@@ -108,15 +108,15 @@ def test_figures_that_are_older_than_the_map_are_drawn_again(
     finished: bytes, tmp_path: Path
 ) -> None:
     """As after an interruption between the file and its figures."""
-    old, new = tmp_path / "jaxgran_map_curves.png", tmp_path / "jaxgran_map_timestep.png"
-    old.write_bytes(b"of before")
-    os.utime(old, (0, 0))
+    curves = tmp_path / "jaxgran_map_curves.png"
+    curves.write_bytes(b"an old figure")
+    os.utime(curves, (0, 0))
     assert jaxgran(tmp_path, *MAP, "--resume").status == 0
-    drawn = old.read_bytes()
-    assert drawn != b"of before" and not new.exists()
-    old.write_bytes(b"of now")
+    assert curves.read_bytes() != b"an old figure"
+    assert not (tmp_path / "jaxgran_map_timestep.png").exists()  # the map has one time step
+    curves.write_bytes(b"a newer figure")
     assert jaxgran(tmp_path, *MAP, "--resume").status == 0
-    assert old.read_bytes() == b"of now"
+    assert curves.read_bytes() == b"a newer figure"
 
 
 def test_an_interrupted_map_does_not_replace_a_finished_one(

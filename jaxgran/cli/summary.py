@@ -44,16 +44,12 @@ def summary_of(data: Any) -> dict[str, Entry]:
     """
     from jaxgran.maps.schema import flag_names, flattened, path_of, shear_stress_ratio
     from jaxgran.maps.variables import SCALARS
-    from jaxgran.model.status import GIVEN_UP, Status
+    from jaxgran.model.status import GIVEN_UP
     from jaxgran.sampling.enskog_factors import LENGTHS
     from jaxgran.sampling.observables import OBSERVABLES
 
     flat = flattened(data)
-    names = flag_names(flat["sums/status"])
-    good = [
-        x for x, name in names.items() if name in Status.__members__ and Status[name] < GIVEN_UP
-    ]
-    strain = flat["sums/strain"].where(flat["sums/status"].isin(good), 0).sum("seed").values
+    strain = flat["sums/strain"].where(flat["sums/status"] < GIVEN_UP).sum("seed").values
     statuses = np.vectorize(flag_names(flat.status).get)(flat.status.values)
     known: dict[str, Entry] = {}
     for name in ("grains", "timestep", "packing_fraction", "restitution"):

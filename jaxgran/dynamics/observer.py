@@ -98,8 +98,8 @@ def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> O
             if not jax.tree.leaves(values):
                 raise refused("observe", values, "must return at least one number")
             for x in jax.tree.leaves(values):
-                kind = getattr(jnp.asarray(x).dtype, "kind", "") if isinstance(x, _NUMBERS) else ""
-                if kind not in tuple("biuf"):  # random keys have none
+                type_of_x = jnp.asarray(x).dtype if isinstance(x, _NUMBERS) else None
+                if getattr(type_of_x, "kind", "O") not in "biuf":  # random keys have none
                     raise refused("observe", x, "must return real numbers")
             return jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), dtype), values)
 

@@ -76,7 +76,10 @@ def measured_ids(data: xr.DataTree) -> dict[ReplicaId, tuple[int, ...]]:
     Raises:
       InputError: (a ValueError) the data have no sums.
     """
-    whole, first_seed = _with_all_axes(data), int(data.attrs["first_seed"])
+    return _places(_with_all_axes(data), int(data.attrs["first_seed"]))
+
+
+def _places(whole: xr.Dataset, first_seed: int) -> dict[ReplicaId, tuple[int, ...]]:
     coords = [[rounded(x) for x in whole[name].values.tolist()] for name in AXES]
     sizes = whole["point_grains"].values[0] if "point_grains" in whole else None
     ids = {}
@@ -104,7 +107,7 @@ def replicas_of(data: xr.DataTree, settings: MapSettings) -> Iterator[Replica]:
     fields = [f"states/{name}" for name in FIELDS if f"states/{name}" in whole]
     states = {path.partition("/")[2]: whole[path].values for path in fields}
     kept = set()
-    for replica, place in measured_ids(data).items():
+    for replica, place in _places(whole, int(data.attrs["first_seed"])).items():
         sums = {name: array[place] for name, array in arrays.items()}
         name = names[int(sums["status"])]
         sums["status"] = np.asarray(Status[name] if name in Status.__members__ else NOT_RUN)

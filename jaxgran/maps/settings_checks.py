@@ -198,8 +198,8 @@ def check_run(run: RunOptions) -> None:
         require_whole("workers", run.workers, 1, _MOST_WORKERS)
     if not isinstance(run.progress, bool) and not callable(run.progress):
         raise refused("progress", run.progress, "must be True, False or a function of one number")
-    known = run.scheduler is None or isinstance(run.scheduler, str)
-    if not known or ":" not in (run.scheduler or ":"):
+    has_port = isinstance(run.scheduler, str) and ":" in run.scheduler
+    if run.scheduler is not None and not has_port:
         reason = "must be an address such as tcp://127.0.0.1:8786"
         raise refused("scheduler", run.scheduler, reason)
     several = run.workers is not None and run.workers > 1

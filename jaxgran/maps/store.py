@@ -161,20 +161,18 @@ class Store:
             if not overwrite:
                 raise self._refused("something other than a map of this version") from None
             return None
-        difference = first_difference(there, self._of_map)
         theirs, ours = common_identity(there), common_identity(self._of_map)
         common = first_difference({x: theirs[x] for x in theirs if x in ours}, ours)
-        same = common is None
-        if resume and same:
+        if resume and common is None:
             return self._of_same_code(data, overwrite)
-        difference = common if resume else difference
         if overwrite:
             return None
+        difference = common if resume else first_difference(there, self._of_map)
         if difference is not None:
             name, before, now = difference
             raise self._refused(
                 f"a map with {name} {short_repr(before)} and not {short_repr(now)}",
-                "pass `resume=True` to extend it, or " if same else "",
+                "pass `resume=True` to extend it, or " if common is None else "",
             )
         raise InputError(
             f"output {short_repr(str(self.output))} already exists and has this map; pass "
@@ -226,13 +224,14 @@ class Store:
                 f"the file settings.json in {str(self.folder)!r} is damaged: remove the folder."
             ) from None
         commit = {"commit": begun.pop("commit", "")}
+        replicas = [*self.folder.glob("replica-*.npz")]
         blocks = self.folder.glob(f"blocks-*-{digest(begun)}.npz")
-        if not begun and not self.output.exists() and [*self.folder.glob("replica-*.npz")]:
+        if not begun and replicas and not self.output.exists():
             raise InputError(
                 f"the folder {str(self.folder)!r} has replicas, and no settings.json that says of "
                 "which map: rename or remove it."
             )
-        if not begun or not [*self.folder.glob("replica-*.npz"), *blocks]:
+        if not begun or not [*replicas, *blocks]:
             for path in self.folder.glob("*.npz"):
                 path.unlink()
             self._write_begun()

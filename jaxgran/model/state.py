@@ -75,8 +75,8 @@ class State(Indexable):
     @property
     def packing_fraction(self) -> Float[Array | np.ndarray, ""]:
         """Area of the grains over that of the cell, ν."""
-        state = in_numpy(self)
-        return (np.pi * state.grains.radii**2).sum(axis=-1) / state.side**2
+        radii, side = in_numpy((self.grains.radii, self.side))  # other parts may be traced
+        return (np.pi * radii**2).sum(axis=-1) / side**2
 
     @property
     def granular_temperature(self) -> Float[Array | np.ndarray, ""]:
@@ -120,11 +120,11 @@ def require_state(flow: ShearFlow, state: State) -> None:
     radii, positions, side, tilt = (known[x] for x in ("radii", "positions", "side", "tilt"))
     if radii is None or side is None:
         return
-    nu, of_state = concrete_or_none(flow.packing_fraction), np.pi * np.sum(radii**2) / side**2
-    if nu is not None and not abs(of_state - nu) <= _ROUNDING:
+    nu = concrete_or_none(flow.packing_fraction)
+    if nu is not None and not _has_fraction_of(flow, state):
         raise InputError(
-            f"packing_fraction must be {of_state:.6g}, which the state has, not {nu:g}: a flow "
-            "with another one begins with a state of its own, from prepare."
+            f"packing_fraction must be {float(state.packing_fraction):.6g}, which the state has, "
+            f"not {nu:g}: a flow with another one begins with a state of its own, from prepare."
         )
     if positions is not None and tilt is not None:
         _require_apart(radii, positions, float(side), float(tilt))
@@ -144,7 +144,7 @@ def status_at_start(flow: ShearFlow, state: State) -> Int[Array, ""]:
             *map(jnp.isfinite, jax.tree.leaves(flow)),
             jnp.asarray(flow.timestep) > 0,
             jnp.asarray(flow.shear_rate) >= 0,
-            abs(state.packing_fraction - flow.packing_fraction) <= _ROUNDING,
+            _has_fraction_of(flow, state),
         )
     )
 
@@ -159,6 +159,10 @@ def _accepts(name: str, numbers: Any, xp: Any) -> Any:
     """Which numbers of an array of a state are accepted, by NumPy or ``jax.numpy``."""
     finite = xp.isfinite(numbers)
     return finite & (numbers > 0) if name in _POSITIVE else finite
+
+
+def _has_fraction_of(flow: ShearFlow, state: State) -> Any:
+    return abs(state.packing_fraction - flow.packing_fraction) <= _ROUNDING
 
 
 def _require_arrays(grains: int, arrays: dict[str, Any]) -> None:

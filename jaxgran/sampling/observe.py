@@ -25,8 +25,8 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 
-# ``advance_batch`` or what does the same, and a wrapper that adds reports or records and leaves the
-# states alone.
+# An AdvanceBatch is ``advance_batch`` or does the same; an AdvanceWrapper adds reports or records,
+# and leaves the states alone.
 AdvanceBatch = Callable[..., tuple[State, Tally]]
 AdvanceWrapper = Callable[[AdvanceBatch], AdvanceBatch]
 
