@@ -451,12 +451,13 @@ def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypa
 
 
 @pytest.mark.parametrize(
-    "moment", ["maps.results.write_dataset", "plotting.map_figures.save_figures"]
+    "moment",
+    ["maps.results.write_dataset", "plotting.map_figures.save_figures", "cli.map.print_map"],
 )
 def test_an_interruption_after_the_last_point_says_how_to_go_on(
     moment: str, tmp_path: Path, monkeypatch
 ) -> None:
-    """While the dataset is written, and while the figures are drawn."""
+    """While the dataset is written, while the figures are drawn, and while tables are printed."""
     write_few_variables(monkeypatch)
     done = {(0, 0): Status.ok, (1, 0): Status.ok}
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(done))

@@ -129,6 +129,7 @@ def test_states_are_written_with_the_forces_between_them(flow, seen, tmp_path: P
         r"path .* already exists": (states, strains, False),
         "strain must increase by at least one time step": (states, [0.5, 0.5001, 0.53], True),
         "states must have one leading axis": (seen[0.0].state, strains, True),
+        "strain must be one number for each": (states, "0.5", True),
     }.items():
         with refused(f"^{words}"):
             write_trajectory(path, flow, wrong[0], wrong[1], overwrite=wrong[2])

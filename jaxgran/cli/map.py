@@ -63,14 +63,14 @@ def run_map_command(
         require_new_figures(output, format)
     data, interrupted, written = run_map(given, quiet)
     whole, pictures = "part" not in data.attrs, []  # the rest of a part is in other files
-    if not interrupted:
-        with told_how_to_resume(output, finished=True):
+    with told_how_to_resume(output, finished=not interrupted):
+        if not interrupted:
             to_draw = data if whole else None
             pictures = draw_beside(to_draw, output, format, overwrite, existed, written)
-    if json:
-        print_json(summary_of(data))
-    elif whole:
-        print_map(data)
+        if json:
+            print_json(summary_of(data))
+        elif whole:
+            print_map(data)
     finish(data, [*([output] if written else []), *pictures], interrupted, quiet, output)
 
 

@@ -57,7 +57,15 @@ from jaxgran.dynamics.snapshots import snapshots_from
 from jaxgran.files import atomic_write, other_version
 from jaxgran.io.paths import as_path, require_absent, require_place
 from jaxgran.model.cell import centred, remap_tilt
-from jaxgran.model.checks import InputError, at_most, refused, require_number, short_repr
+from jaxgran.model.checks import (
+    InputError,
+    as_array,
+    at_most,
+    refused,
+    require,
+    require_number,
+    short_repr,
+)
 from jaxgran.model.flow import ShearFlow, require_sheared, steps_of_strain
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State, require_state
@@ -174,7 +182,9 @@ def write_trajectory(
     check_trajectory(path)
     if not overwrite:
         require_absent(path, "path")
-    strains = np.asarray(strain, np.float64)
+    numbers = as_array(strain)
+    require("strain", numbers, np.isfinite, "one number for each of the states")
+    strains = np.asarray(numbers, np.float64)
     steps = _steps_of_frames(flow, states, strains)
     numerics = checked_numerics(solver, None)
     if force_strain is not None:
