@@ -171,7 +171,9 @@ def _influences(
     flat, by_name = _flat(estimate(jax.tree.map(whole_and_parts, sums)))
     without = flat[1:].astype(float) if total > 1 else np.full(flat.shape, np.nan)
     influence = (total - 1) * (without.mean(axis=0) - without)
-    scale = np.sqrt(np.mean(influence**2, axis=0))
+    largest = np.max(np.abs(influence), axis=0)  # squares of tiny and huge numbers are lost
+    unit = np.where(largest > 0, largest, 1)
+    scale = unit * np.sqrt(np.mean((influence / unit) ** 2, axis=0))
     scale = np.where(scale <= _ROUNDING * total * np.abs(flat[0]), 0, scale)
     alternating = (-1.0) ** np.arange(len(influence))[:, None]  # stands for blocks without scatter
     influence = np.where(scale == 0, alternating, influence / np.where(scale == 0, 1, scale))

@@ -4,7 +4,6 @@ flow.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 
 import jax
 import numpy as np
@@ -66,24 +65,21 @@ def random_replica(
     point: int = 0,
     seed: int = 0,
 ) -> Replica:
-    """Return a replica of a map with random sums, the same area for all and a strain of 3 before
-    the sample.
-    """
+    """Return a replica of a map with random sums and a strain of 3 before the sample."""
     name = replica_id(settings, point, seed)
     flow = settings.flows[name.point]
     sample = sample_of_tally(random_tally(rng, BLOCKS, status=status), flow)
-    mass = mass_of_grains(flow.packing_fraction, sample.area)
-    return Replica(name, replace(sample, mass=mass), int(status), 3.0)
+    return Replica(name, sample, int(status), 3.0)
 
 
-def sample_of_tally(tally: Tally, flow: ShearFlow, area: float = 100.0) -> Sample:
-    """Return the sample of a tally in a cell of this area, or of one of a batch, of grains of mass
-    one.
-    """
+def sample_of_tally(tally: Tally, flow: ShearFlow) -> Sample:
+    """Return the sample of a tally, or of a batch of them, of grains of uniform diameters."""
+    squares = flow.grains * (1 + flow.polydispersity**2 * (1 - flow.grains**-2) / 3)  # Σ d²
+    area = np.pi / 4 * squares / flow.packing_fraction
+    of_one = area, mass_of_grains(flow.packing_fraction, area), flow
     replicas = np.shape(tally.steps)[:-1]
-    numbers = jax.tree.map(lambda x: np.full(replicas, x)[()], flow)
-    mass = np.full(replicas, float(flow.grains))[()]
-    return Sample(tally, np.full(replicas, area)[()], mass, numbers)
+    numbers = jax.tree.map(lambda x: np.full(replicas, x)[()], of_one)
+    return Sample(tally, *numbers)
 
 
 def random_instant(seed: int, grains: int = 20, pairs: int = 7) -> ForceNetwork:

@@ -167,8 +167,8 @@ def test_point_is_the_ratio_of_the_sums_of_its_seeds_that_were_not_given_up(data
         ratio = sum(t.impulse.sum() for t in tallies) / sum(t.binary_impulse.sum() for t in tallies)
         assert flow.force_ratio == pytest.approx(ratio)
         moment = sum(t.contact_moment.sum(axis=0) for t in tallies)
-        duration = sum(t.duration.sum() for t in tallies)
-        np.testing.assert_allclose(flow["stresses"].contact_stress, moment / duration / 100.0)
+        volume = sum(t.duration.sum() for t in tallies) * results[point, 0].sample.area
+        np.testing.assert_allclose(flow["stresses"].contact_stress, moment / volume)
         assert flow["diagnostics"].max_overlap == max(t.largest_overlap.max() for t in tallies)
 
 

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from flows import flow_of
-from synthetic import sample_of_tally
+from synthetic import refused, sample_of_tally
 
 import jaxgran as jg
 from jaxgran.contact.projected_methods import BarzilaiBorwein
@@ -71,9 +71,9 @@ def chaotic_tally(
     )
 
 
-def sample_of(tallies: list[Tally], grains: int = GRAINS, area: float = AREA) -> Sample:
+def sample_of(tallies: list[Tally], flow: jg.ShearFlow = FLOW) -> Sample:
     blocks = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *tallies)
-    return sample_of_tally(blocks, replace(FLOW, grains=grains), area)
+    return sample_of_tally(blocks, flow)
 
 
 def chaotic_sample(seed: int, **factors: float) -> Sample:
@@ -86,7 +86,7 @@ def sheared(engines, flowing, packing_fraction: float, blocks: int) -> Sample:
     for _ in range(blocks):
         state, tally = engines["numba"](flow, state, 500, BarzilaiBorwein())
         tallies.append(tally)
-    return sample_of(tallies, flow.grains, float(state.side) ** 2)
+    return sample_of(tallies, flow)
 
 
 @pytest.mark.parametrize("packing_fraction", [0.2, 0.75])
@@ -214,3 +214,23 @@ def test_elastic_grains_have_no_correlation_length() -> None:
     value, _ = measured_over_enskog(replace(FLOW, restitution=1.0), [sample_of([elastic] * 2)])
     assert np.isnan([value["correlation_length"], value["dissipation_rate_pairs"]]).all()
     assert value["enskog_dissipation_rate"] == 0 and np.isfinite(value["pressure_pairs"])
+
+
+def test_own_grains_must_be_given_and_the_unit_of_mass_changes_no_factor() -> None:
+    sample = chaotic_sample(0)
+    heavy = replace(sample, mass=4 * sample.mass)  # in another unit: all moments are as many times
+    moments = "contact_moment binary_moment binary_speed_moment kinetic_moment local_kinetic "
+    times = {
+        x: 4 * getattr(sample.tally, x)
+        for x in (moments + "dissipation binary_dissipation").split()
+    }
+    heavy = replace(heavy, tally=replace(sample.tally, **times))
+    grains = jg.own_grains(np.ones(GRAINS), 4 * np.ones(GRAINS))
+    for other in (heavy, replace(sample, area=1.1 * sample.area)):
+        with refused("grains must be given"):
+            measured_over_enskog(FLOW, [other])
+    expected, _ = measured_over_enskog(FLOW, [sample])
+    value, _ = measured_over_enskog(FLOW, [heavy], grains)
+    for name, factor in expected.items():
+        unit = 4 if name.startswith("enskog_") else 1
+        np.testing.assert_allclose(value[name], unit * factor, rtol=1e-9)

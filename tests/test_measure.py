@@ -86,9 +86,8 @@ def test_averages_are_those_of_all_blocks_together() -> None:
     tally = random_tally(np.random.default_rng(0), BLOCKS)
     sample = sample_of_tally(tally, FLOWS[0])
     assert sample.force_ratio == pytest.approx(tally.impulse.sum() / tally.binary_impulse.sum())
-    stress = (
-        (tally.contact_moment + tally.kinetic_moment).sum(axis=0) / tally.duration.sum() / 100.0
-    )
+    moment = (tally.contact_moment + tally.kinetic_moment).sum(axis=0)
+    stress = moment / tally.duration.sum() / sample.area
     assert sample.pressure == pytest.approx(np.trace(stress) / 2)
     assert sample.shear_stress == pytest.approx(-stress[0, 1])
     assert sample.averages["max_overlap"] == tally.largest_overlap.max()

@@ -150,14 +150,30 @@ def test_theory_of_given_grains_is_that_of_their_law():
     unit.
     """
     grains = polydisperse(256, 0.26, jax.random.key(0))
-    diameters, masses = size_classes(grains)
-    given = mixture_moments(0.8, 0.6, 1.0, diameters, masses)
+    diameters, masses, fractions = size_classes(grains)
+    given = mixture_moments(0.8, 0.6, 1.0, diameters, masses, fractions)
     law = gaussian_moments(0.8, 0.6, 1.0, 0.26)
-    doubled = mixture_moments(0.8, 0.6, 1.0, diameters, 2 * masses)
+    doubled = mixture_moments(0.8, 0.6, 1.0, diameters, 2 * masses, fractions)
     for name in ("granular_temperature", "pressure", "shear_stress", "collision_rate"):
         assert getattr(given, name) == pytest.approx(float(getattr(law, name)), rel=1e-2)
         unit = 1 if name == "collision_rate" else 2
         assert getattr(doubled, name) == pytest.approx(unit * float(getattr(given, name)), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "error"),
+    [([1] * 15 + [3], 1e-9), ([1, 1, 1, 2, 2, 4], 1e-9), (np.geomspace(0.3, 3, 48), 5e-3)],
+)
+def test_theory_of_few_species_is_that_of_each_and_of_wide_distributions_nearly(sizes, error):
+    """Against a class for every single grain; a heavier half of the grains are species too."""
+    diameters = np.repeat(np.asarray(sizes, float) / np.mean(sizes), 2)
+    masses = diameters**2 * (np.tile([1.0, 3.0], len(sizes)) if error < 1e-8 else 1.0)
+    grains = Grains(jnp.asarray(diameters / 2), jnp.asarray(masses))
+    each = np.full(diameters.size, 1 / diameters.size)
+    classes = mixture_moments(0.5, 0.7, 1.0, *size_classes(grains))
+    whole = mixture_moments(0.5, 0.7, 1.0, diameters, masses, each)
+    for name in ("granular_temperature", "pressure", "shear_stress", "collision_rate"):
+        assert getattr(classes, name) == pytest.approx(float(getattr(whole, name)), rel=2 * error)
 
 
 def test_cell_lists_of_unlike_grains_are_complete_or_flagged():

@@ -49,7 +49,7 @@ def test_the_grains_are_those_that_are_given_at_the_packing_fraction(
 def test_theory_is_that_of_the_mixture(bidisperse: xr.DataTree) -> None:
     small, large = np.array([1.0, RATIO]) * 2 / (1 + RATIO)
     diameters = np.array([small, large])
-    theory = mixture_moments(0.9, 0.6, 1.0, diameters, diameters**2)
+    theory = mixture_moments(0.9, 0.6, 1.0, diameters, diameters**2, np.array([0.5, 0.5]))
     there = bidisperse["theory"]
     for name in ("granular_temperature", "pressure", "shear_stress", "collision_rate"):
         np.testing.assert_allclose(there[name].item(), getattr(theory, name), rtol=1e-6)

@@ -251,7 +251,7 @@ class MapSettings:
         """Discs in the proportions of the given diameters, for kinetic theory; None where diameters
         are uniform.
         """
-        return None if self.diameters is None else self.grains_of(8 * len(self.diameters), replicas)
+        return None if self.diameters is None else self.grains_of(len(self.diameters), replicas)
 
 
 def rounded(number: Any) -> Any:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.model.checks import InputError, concrete_or_none, is_traced, require_native, two_digits
 from jaxgran.model.display import rounded
-from jaxgran.model.flow import ShearFlow, require_flow
+from jaxgran.model.flow import RANGES, ShearFlow, require_flow
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import Status
 from jaxgran.model.values import Indexable, in_numpy
@@ -132,7 +132,7 @@ def require_state(flow: ShearFlow, state: State) -> None:
 
 def status_at_start(flow: ShearFlow, state: State) -> Int[Array, ""]:
     """``Status.nonfinite`` unless an engine can advance a state: it has passed ``require_state``,
-    the numbers of the flow are finite, and its time step is positive.
+    the numbers of the flow are finite, and in the ranges of ``ShearFlow``.
 
     Traced values are known in compiled code only.
     """
@@ -144,6 +144,7 @@ def status_at_start(flow: ShearFlow, state: State) -> Int[Array, ""]:
             *map(jnp.isfinite, jax.tree.leaves(flow)),
             jnp.asarray(flow.timestep) > 0,
             jnp.asarray(flow.shear_rate) >= 0,
+            *(RANGES[x][0](jnp.asarray(getattr(flow, x))) for x in ("restitution", "activation")),
             _has_fraction_of(flow, state),
         )
     )

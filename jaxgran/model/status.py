@@ -42,15 +42,15 @@ MEANINGS = {
     "more grains or a larger error",
     "short_sample": "the sample lasts only a few correlation strains, so its errors may be too "
     "small",
-    "not_steady": "temperature, pressure or total momentum still drifted, sample longer, or "
-    "prepare longer by `equilibrate`",
+    "not_steady": "temperature, pressure or total momentum still drifted, or `equilibrate` is "
+    "below the correlation strain, sample or prepare longer",
     "deep_overlap": "contacts overlap by too large a part of the gap between grains, so that the "
     "pressure may be off by more than 3 %, take a shorter time step",
     "infeasible": "no impulses satisfy the contact law, the packing is jammed, lower the packing "
     "fraction",
     "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",
-    "nonfinite": "a number of the flow, its state or its sums is not finite, or the packing "
-    "fraction is not that of the state",
+    "nonfinite": "a number of the flow, its state or its sums is not finite or out of its range, "
+    "or the packing fraction is not that of the state",
     "failed": "workers of a cluster died of it, perhaps for lack of memory; pass `resume=True` to "
     "try once more",
     "not_run": "the point was not run",

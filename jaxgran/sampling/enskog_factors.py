@@ -45,13 +45,14 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran.dynamics.tally import Tally
+from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
+from jaxgran.sampling.correlation_strain import mass_of_grains
 from jaxgran.sampling.prediction import size_classes
 from jaxgran.sampling.sample import Sample, lengths
 from jaxgran.statistics import Estimates, standard_errors
@@ -81,7 +82,12 @@ def measured_over_enskog(
     Args:
       flow: parameters of the samples.
       seeds: samples of replicas of this flow.
-      grains: discs in the proportions of those of the flow; None where their diameters are uniform.
+      grains: discs in the proportions of those of the flow; None where their diameters are uniform
+        and their masses the squares of these.
+
+    Raises:
+      InputError: (a ValueError) ``grains`` is None, and size or mass of the discs is not that of
+        uniform diameters.
 
     Returns:
       Values and errors by name: ``pressure_chaos`` and so on for each of ``RATES`` and
@@ -91,12 +97,25 @@ def measured_over_enskog(
         ``correlation_length_from_pressure`` L′ in σ. What would be a quotient by zero is NaN, such
         as a factor without collisions or of the dissipation rate of elastic grains.
     """
+    if grains is None:
+        _require_uniform(flow, seeds[0])
     sums = jax.tree.map(
         lambda *x: np.stack([np.asarray(part) for part in x]), *(seed.tally for seed in seeds)
     )
     return standard_errors(
         partial(_factors, flow, grains, np.asarray(seeds[0].area)), sums, *lengths(seeds)
     )
+
+
+def _require_uniform(flow: ShearFlow, sample: Sample) -> None:
+    """Raise an InputError if the mean d² or the mean mass is not that of ``polydisperse`` discs."""
+    uniform = 1 + flow.polydispersity**2 * (1 - flow.grains**-2) / 3
+    mass = mass_of_grains(flow.packing_fraction, sample.area)
+    if not np.allclose([mass, sample.mass], flow.grains * uniform, rtol=1e-3):
+        raise InputError(
+            "grains must be given, as those of the samples have no uniform diameters d or not the "
+            "masses d²."
+        )
 
 
 def _factors(
@@ -181,6 +200,6 @@ def _collisional_transfer(
 ) -> Collisions:
     if classes is None:
         return jax.vmap(lambda tensor: collisional_transfer(tensor, *numbers))(tensors)
-    (alpha, nu, rate, _), (diameters, masses) = numbers, classes
-    mixture = mixture_of(nu, diameters, masses, jnp.full(diameters.shape, 1 / diameters.size))
+    alpha, nu, rate, _ = numbers
+    mixture = mixture_of(nu, *classes)
     return jax.vmap(lambda tensor: enskog_collisions(tensor, alpha, rate, mixture))(tensors)

@@ -1,7 +1,6 @@
 """What kinetic theory predicts for a batch of flows, as arrays of NumPy."""
 
-from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -15,7 +14,7 @@ from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
 from jaxgran.theory.steady_shear import SteadyShear
 
 _TOGETHER = 16  # flows of one call: one compiled program serves batches of any size
-_SIZE_CLASSES = 8  # of given grains
+_SIZE_CLASSES = 8  # of given grains; with more, averages of wide distributions hardly change
 _LARGEST_RESTITUTION = 0.99  # the temperature diverges at α = 1
 
 
@@ -28,8 +27,7 @@ def kinetic_theory(
 ) -> SteadyShear:
     """``gaussian_moments`` of many flows, (replicas,) each; not finite where α is 1.
 
-    Given grains (replicas, grains) are taken as a mixture of eight classes, sorted by diameter and
-    then by mass.
+    Given grains (replicas, grains) are taken as a mixture of ``size_classes``.
     """
     numbers = np.stack(
         np.broadcast_arrays(restitution, packing_fraction, shear_rate, polydispersity), axis=-1
@@ -61,16 +59,58 @@ def _moments(numbers: Float[Array, "flows 4"], *classes: Float[Array, "flows cla
     return jax.vmap(mixture_moments)(alpha, nu, rate, *classes)
 
 
-def size_classes(grains: Grains) -> tuple[np.ndarray, np.ndarray]:
-    """Mean diameters and masses (..., classes) of classes of equal numbers of grains (..., grains),
-    sorted by diameter and then by mass.
+def size_classes(grains: Grains) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean diameters, mean masses and number fractions (..., 8) of classes of like grains, from
+    grains (..., grains).
+
+    From one class on, that one is divided by its diameters or its masses which lowers the variance
+    within classes most. So up to eight species are the classes; of fewer the last is repeated,
+    without grains.
     """
-    radii, masses = np.asarray(grains.radii), np.asarray(grains.masses)
-    order = np.lexsort((masses, radii))
-    edges = np.arange(_SIZE_CLASSES + 1) * order.shape[-1] // _SIZE_CLASSES
-    members = [order[..., first:last] for first, last in pairwise(edges)]
-    mean_radii, mean_masses = (
-        np.stack([np.mean(np.take_along_axis(x, numbers, -1), -1) for numbers in members], axis=-1)
-        for x in (radii, masses)
-    )
-    return mean_radii / np.mean(mean_radii, -1, keepdims=True), mean_masses
+    radii, masses = np.asarray(grains.radii, float), np.asarray(grains.masses, float)
+    discs = np.stack([radii / np.mean(radii, axis=-1, keepdims=True), masses], axis=-1)
+    rows = [_classes_of(x) for x in discs.reshape(-1, *discs.shape[-2:])]
+    columns = np.stack(rows).reshape(*radii.shape[:-1], _SIZE_CLASSES, 3)
+    diameters, mean_masses, fractions = np.moveaxis(columns, -1, 0)
+    return diameters, mean_masses, fractions
+
+
+def _classes_of(discs: np.ndarray) -> np.ndarray:
+    """Mean diameter, mean mass and number fraction (8, 3) of the classes of discs (grains, 2)."""
+    species, counts = np.unique(discs, axis=0, return_counts=True)
+    scaled = species / np.average(species, axis=0, weights=counts)
+    parts = [_halves(scaled, counts, np.arange(len(counts)))]
+    while len(parts) < _SIZE_CLASSES and any(part.halves for part in parts):
+        widest = parts.pop(int(np.argmax([part.gain for part in parts])))
+        parts += [_halves(scaled, counts, half) for half in widest.halves]
+    rows = [
+        (*np.average(species[x.whole], axis=0, weights=counts[x.whole]), counts[x.whole].sum())
+        for x in parts
+    ]
+    rows += [(*rows[-1][:2], 0)] * (_SIZE_CLASSES - len(rows))
+    return np.array(rows) / [1, 1, len(discs)]
+
+
+class _Halves(NamedTuple):
+    """A class of species by their numbers, its best division, and by how much this lowers the sum
+    of squares within classes; 0 for a single species.
+    """
+
+    whole: np.ndarray
+    halves: tuple[np.ndarray, ...]
+    gain: float
+
+
+def _halves(species: np.ndarray, counts: np.ndarray, whole: np.ndarray) -> _Halves:
+    best = _Halves(whole, (), 0.0)
+    for column in species[whole].T:
+        order = whole[np.argsort(column, kind="stable")]
+        number = np.cumsum(counts[order])[:, None]
+        total = np.cumsum(counts[order, None] * species[order], axis=0)
+        below, above = total[:-1] ** 2 / number[:-1], total[-1] - total[:-1]
+        squares = below + above**2 / (number[-1] - number[:-1]) - total[-1] ** 2 / number[-1]
+        gains = squares.sum(axis=1)
+        if len(gains) and gains.max() > best.gain:
+            cut = int(np.argmax(gains)) + 1
+            best = _Halves(whole, (order[:cut], order[cut:]), float(gains[cut - 1]))
+    return best

@@ -70,9 +70,9 @@ def mixture_moments(
     shear_rate: Scalar,
     diameters: Float[Array, " classes"],
     masses: Float[Array, " classes"],
+    fractions: Float[Array, " classes"],
 ) -> SteadyShear:
-    """``gaussian_moments`` of a mixture with the same number of grains in each class of diameter
-    and mass.
+    """``gaussian_moments`` of a mixture of classes of grains.
 
     ================  =======  ====================================================
     name              unit     meaning
@@ -82,12 +82,12 @@ def mixture_moments(
     shear_rate        1/t      γ̇ > 0
     diameters         σ        (classes,), of mean one
     masses            m        (classes,)
+    fractions         –        (classes,), number fractions
     returns                    SteadyShear
     ================  =======  ====================================================
     """
     alpha, nu, rate = as_floats(restitution, packing_fraction, shear_rate)
-    fractions = jnp.full(diameters.shape, 1 / diameters.size, nu.dtype)
-    guess = jnp.log(garzo_dufty(alpha, nu).granular_temperature * jnp.mean(masses))
+    guess = jnp.log(garzo_dufty(alpha, nu).granular_temperature * jnp.sum(fractions * masses))
     return steady_moments(alpha, rate, mixture_of(nu, diameters, masses, fractions), guess)
 
 
