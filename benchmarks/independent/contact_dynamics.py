@@ -20,9 +20,9 @@ never jumps over free flight; everything else is made to be fast:
 - *Kinetic stress for free.* Its sums are carried through flights and impulses, so no step visits
   all grains.
 
-Axes: positions and velocities are ``(grains, 2)``, radii and masses ``(grains,)``. Velocities are
-peculiar: the laboratory velocity is ``velocity + shear_rate * y`` along x. The periodic cell has
-the lattice vectors ``(side, 0)`` and ``(tilt * side, side)``, tilt in [-1/2, 1/2).
+Velocities are peculiar: the laboratory velocity is ``velocity + shear_rate * y`` along x. The
+periodic cell has the lattice vectors ``(side, 0)`` and ``(tilt * side, side)``, with a tilt in
+[-1/2, 1/2).
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ INNER_SKIN, OUTER_SKIN = 1.8, 3.0
 BLOCK = 64  # near pairs tested together
 ROW = 8  # numbers a contact brings to the solver
 FAR = 1e300
+# Places of the sums over a run: stresses have the components xx, xy, yy
+IMPULSE, BINARY, CONTACT_STRESS, BINARY_STRESS, KINETIC, SUMS = 0, 1, 2, 5, 8, 11
 
 # Fused multiply-adds are the only liberty taken with the arithmetic: infinities and NaN keep their
 # meaning.
@@ -54,22 +56,12 @@ class Tally(NamedTuple):
     steps.
     """
 
-    steps: int
     impulse: float  # sum of p
     binary_impulse: float  # sum of (1 + restitution) * reduced mass * max(0, -normal velocity)
     contact_stress: np.ndarray
     binary_stress: np.ndarray
     kinetic_stress: np.ndarray
     temperature: float
-    contacts: int
-    collisions: int  # contacts that approach
-    solves: int  # steps with at least one approaching contact
-    sweeps: int  # of the slowest cluster, summed over the solves
-    updates: int  # single-contact updates over all sweeps
-    unconverged: int  # clusters that met the cap on sweeps
-    largest_overlap: float
-    outer_rebuilds: int
-    inner_rebuilds: int
 
     @property
     def force_ratio(self) -> float:
@@ -88,40 +80,15 @@ class Tally(NamedTuple):
         return -(self.contact_stress[1] + self.kinetic_stress[1])
 
 
-# Indices into the accumulator that the compiled loop fills.
-(
-    _IMPULSE,
-    _BINARY,
-    _CXX,
-    _CXY,
-    _CYY,
-    _BXX,
-    _BXY,
-    _BYY,
-    _KXX,
-    _KXY,
-    _KYY,
-    _CONTACTS,
-    _COLLISIONS,
-    _SOLVES,
-    _SWEEPS,
-    _UPDATES,
-    _UNCONVERGED,
-    _OVERLAP,
-    _OUTER,
-    _INNER,
-    _SIZE,
-) = range(21)
-
-
 @compiled
-def _outer_pairs(x, y, radii, side, tilt, skin, heads, links, first, second, shift_x, image):
+def _outer_pairs(x, y, radii, side, tilt, skin, heads, links, outer):
     """Pairs with a gap below the skin, the x shift and the row of the image; positions lie in the
     primary cell.
 
     Returns the number found, which may exceed the room in the arrays: then only the count is
     meaningful.
     """
+    first, second, shift_x, image = outer
     grains = x.size
     room = first.size
     count = 0
@@ -164,19 +131,10 @@ def _outer_pairs(x, y, radii, side, tilt, skin, heads, links, first, second, shi
                 # the cell itself, its right neighbour, and the three above
                 to_row = row + (1 if k >= 2 else 0)
                 to_column = column + (k - 3 if k >= 2 else k)
-                ny = 0.0
-                nx = 0.0
-                if to_row == rows:
-                    to_row = 0
-                    ny = 1.0
-                if to_column == columns:
-                    to_column = 0
-                    nx = 1.0
-                elif to_column < 0:
-                    to_column = columns - 1
-                    nx = -1.0
+                ny = float(to_row // rows)
+                nx = float(to_column // columns)
                 across = (nx + ny * tilt) * side
-                other = heads[to_row * columns + to_column]
+                other = heads[to_row % rows * columns + to_column % columns]
                 i = start
                 while i >= 0:
                     xi = x[i] - across
@@ -217,11 +175,10 @@ def _gauss_seidel(first, second, rows, impulse, kick_x, kick_y, start, stop, tar
     normal velocity times the reduced mass, and one over the reduced mass. Without relaxation the
     update of a contact over its reduced mass is its residual min(diag(W) p, w), so a sweep
     estimates the norm for nothing; the residual of a single state decides. ``target`` is the square
-    of the norm to reach. Indices are unsigned, which spares the test for negative ones. Returns the
-    sweeps done, negative at the cap.
+    of the norm to reach. Indices are unsigned, which spares the test for negative ones.
     """
     relax = RELAX_LARGE if stop - start > SMALL else RELAX_SMALL
-    for sweep in range(MAX_SWEEPS):
+    for _ in range(MAX_SWEEPS):
         seen = 0.0
         for c in range(np.uint64(start), np.uint64(stop)):
             row = np.uint64(ROW) * c
@@ -256,10 +213,9 @@ def _gauss_seidel(first, second, rows, impulse, kick_x, kick_y, start, stop, tar
                 residual = min(impulse[c], -fall) * rows[row + np.uint64(7)]
                 true += residual * residual
             if true <= target:
-                return sweep + 1
+                return
         elif not seen < math.inf:
-            break
-    return -MAX_SWEEPS
+            return
 
 
 @compiled
@@ -276,8 +232,9 @@ def _pad(parabola, count):
 
 
 @compiled
-def _refresh(p, first, second, shift_x, shift_y, touch, x, y, vx, vy, shear_rate, parabola):
+def _refresh(p, near, x, y, vx, vy, shear_rate, parabola):
     """The parabola of a near pair from its grains."""
+    first, second, shift_x, shift_y, touch = near
     i = first[p]
     j = second[p]
     ux = vx[i] - vx[j] - shear_rate * shift_y[p]
@@ -292,24 +249,14 @@ def _refresh(p, first, second, shift_x, shift_y, touch, x, y, vx, vy, shear_rate
 
 
 @compiled
-def _run(
-    x,
-    y,
-    vx,
-    vy,
-    radii,
-    masses,
-    side,
-    tilt,
-    shear_rate,
-    restitution,
-    dt,
-    theta,
-    tolerance,
-    steps,
-    room,
-    sums,
-):
+def _add_stress(sums, place, push, nx, ny):
+    sums[place] += push * nx * nx
+    sums[place + 1] += push * nx * ny
+    sums[place + 2] += push * ny * ny
+
+
+@compiled
+def _run(x, y, vx, vy, radii, masses, side, tilt, law, steps, room, sums):
     """The loop. Positions and LABORATORY velocities (unwrapped) are advanced in place.
 
     Between two rebuilds of the inner list grain positions are referred to the time of the rebuild:
@@ -320,6 +267,7 @@ def _run(
     in here would make numba count their references in every step.) Returns the tilt, the steps done
     and the pairs found, -1 if the time step is too long for the cell.
     """
+    shear_rate, restitution, dt, theta, tolerance = law
     grains = x.size
     largest = 2.0 * radii.max()
     ahead = theta * dt
@@ -331,11 +279,13 @@ def _run(
     outer_second = np.empty(room, np.uint32)
     outer_shift = np.empty(room)
     outer_image = np.empty(room)
+    outer = outer_first, outer_second, outer_shift, outer_image
     inner_first = np.empty(room, np.uint32)
     inner_second = np.empty(room, np.uint32)
     inner_x = np.empty(room)  # shift of the image at the rebuild
     inner_y = np.empty(room)
     inner_touch = np.empty(room)  # sum of radii
+    near = inner_first, inner_second, inner_x, inner_y, inner_touch
     parabola = np.empty((room // BLOCK + 1, 3, BLOCK))  # |s|^2 - D^2 = [0] + 2 [1] t + [2] t^2
     chain = np.empty(2 * room + 2, np.int64)  # pairs of a grain, as a linked list of 2 * pair + end
     chain_heads = np.empty(grains, np.int64)
@@ -365,7 +315,7 @@ def _run(
     raw_distance = np.empty(room)
 
     pairs = 0
-    outer = 0
+    found = 0
     outer_skin = -1.0  # forces the first rebuilds
     inner_skin = -1.0
     outer_strain = 0.0
@@ -414,14 +364,12 @@ def _run(
             )
             if not rate * ahead <= inner_skin:
                 done = step
-                outer = -1
+                found = -1
                 break
             used = (
                 2.0 * math.sqrt(farthest) + abs(outer_strain) * (largest + inner_skin) + inner_skin
             )
-            sums[_INNER] += 1
             if not used <= outer_skin:
-                sums[_OUTER] += 1
                 tilt += outer_strain
                 tilt -= math.floor(tilt + 0.5)
                 outer_strain = 0.0
@@ -436,27 +384,14 @@ def _run(
                     x[i] -= math.floor((x[i] - tilt * y[i]) / side) * side
                     start_x[i] = x[i]
                     start_y[i] = y[i]
-                outer = _outer_pairs(
-                    x,
-                    y,
-                    radii,
-                    side,
-                    tilt,
-                    outer_skin,
-                    heads,
-                    links,
-                    outer_first,
-                    outer_second,
-                    outer_shift,
-                    outer_image,
-                )
-                if outer > room:
+                found = _outer_pairs(x, y, radii, side, tilt, outer_skin, heads, links, outer)
+                if found > room:
                     done = step
                     break
             pairs = 0
             for i in range(grains):
                 chain_heads[i] = -1
-            for p in range(outer):
+            for p in range(found):
                 i = outer_first[p]
                 j = outer_second[p]
                 shift_x = outer_shift[p] + outer_strain * side * outer_image[p]
@@ -466,18 +401,12 @@ def _run(
                 touch = radii[i] + radii[j]
                 squared = dx * dx + dy * dy
                 if squared < (touch + inner_skin) * (touch + inner_skin):
-                    ux = vx[i] - vx[j] - shear_rate * shift_y
-                    uy = vy[i] - vy[j]
                     inner_first[pairs] = i
                     inner_second[pairs] = j
                     inner_x[pairs] = shift_x
                     inner_y[pairs] = shift_y
                     inner_touch[pairs] = touch
-                    block = pairs // BLOCK
-                    q = pairs % BLOCK
-                    parabola[block, 0, q] = squared - touch * touch
-                    parabola[block, 1, q] = dx * ux + dy * uy
-                    parabola[block, 2, q] = ux * ux + uy * uy
+                    _refresh(pairs, near, x, y, vx, vy, shear_rate, parabola)
                     chain[2 * pairs] = chain_heads[i]
                     chain[2 * pairs + 1] = chain_heads[j]
                     chain_heads[i] = 2 * pairs
@@ -486,9 +415,9 @@ def _run(
             blocks = _pad(parabola, pairs)
             rate = 2.0 * fastest + abs(shear_rate) * (largest + inner_skin)
 
-        sums[_KXX] += sxx
-        sums[_KXY] += sxy
-        sums[_KYY] += syy
+        sums[KINETIC] += sxx
+        sums[KINETIC + 1] += sxy
+        sums[KINETIC + 2] += syy
 
         # Activation: free flight over theta dt touches.
         contacts = 0
@@ -519,11 +448,8 @@ def _run(
                             contact_pair[contacts] = block * BLOCK + q
                             contacts += 1
                             approaching += 1 if half < 0.0 else 0
-        sums[_CONTACTS] += contacts
 
         if approaching > 0:
-            sums[_COLLISIONS] += approaching
-            sums[_SOLVES] += 1
             hits = 0
             drive = 0.0
             for c in range(contacts):
@@ -542,7 +468,6 @@ def _run(
                 raw_normals[c, 1] = dy
                 raw_speed[c] = speed
                 raw_distance[c] = distance
-                sums[_OVERLAP] = max(sums[_OVERLAP], inner_touch[p] - distance)
                 if speed < 0.0:
                     drive += speed * speed
                 for g in (i, j):
@@ -569,15 +494,11 @@ def _run(
                         kick_x[j] = -push * nx * inverse_mass[j]
                         kick_y[j] = -push * ny * inverse_mass[j]
                         push *= 1.0 + restitution
-                        sums[_IMPULSE] += push
-                        sums[_BINARY] += push
+                        sums[IMPULSE] += push
+                        sums[BINARY] += push
                         push *= raw_distance[c]
-                        sums[_CXX] += push * nx * nx
-                        sums[_CXY] += push * nx * ny
-                        sums[_CYY] += push * ny * ny
-                        sums[_BXX] += push * nx * nx
-                        sums[_BXY] += push * nx * ny
-                        sums[_BYY] += push * ny * ny
+                        _add_stress(sums, CONTACT_STRESS, push, nx, ny)
+                        _add_stress(sums, BINARY_STRESS, push, nx, ny)
                 else:
                     net[coupled] = c
                     coupled += 1
@@ -585,7 +506,6 @@ def _run(
                     b = _root(parent, np.int64(j))
                     parent[a] = b
 
-            most = 1
             if coupled > 0:
                 # Number the clusters in which something approaches, sort their contacts by cluster.
                 clusters = 0
@@ -639,24 +559,9 @@ def _run(
                 for m in range(clusters):
                     begin = cluster_start[m]
                     end = cluster_start[m + 1]
-                    size = end - begin
-                    allowed = 0.5 * cluster_drive[m] + 0.5 * drive * size / total
-                    sweeps = _gauss_seidel(
-                        first,
-                        second,
-                        rows,
-                        impulse,
-                        kick_x,
-                        kick_y,
-                        begin,
-                        end,
-                        tolerance * tolerance * allowed,
-                    )
-                    if sweeps < 0:
-                        sweeps = -sweeps
-                        sums[_UNCONVERGED] += 1
-                    sums[_UPDATES] += sweeps * size
-                    most = max(most, sweeps)
+                    allowed = 0.5 * cluster_drive[m] + 0.5 * drive * (end - begin) / total
+                    target = tolerance * tolerance * allowed
+                    _gauss_seidel(first, second, rows, impulse, kick_x, kick_y, begin, end, target)
 
                 for d in range(total):
                     c = source[d]
@@ -664,17 +569,12 @@ def _run(
                     ny = raw_normals[c, 1]
                     push = (1.0 + restitution) * impulse[d]
                     single = (1.0 + restitution) * max(0.0, -rows[ROW * d + 6])
-                    sums[_IMPULSE] += push
-                    sums[_BINARY] += single
+                    sums[IMPULSE] += push
+                    sums[BINARY] += single
                     push *= raw_distance[c]
                     single *= raw_distance[c]
-                    sums[_CXX] += push * nx * nx
-                    sums[_CXY] += push * nx * ny
-                    sums[_CYY] += push * ny * ny
-                    sums[_BXX] += single * nx * nx
-                    sums[_BXY] += single * nx * ny
-                    sums[_BYY] += single * ny * ny
-            sums[_SWEEPS] += most
+                    _add_stress(sums, CONTACT_STRESS, push, nx, ny)
+                    _add_stress(sums, BINARY_STRESS, single, nx, ny)
 
             # Kick the grains, keep the kinetic sums and the bound on the speed, clean up.
             kicked = 0
@@ -704,38 +604,12 @@ def _run(
                     y[g] -= ay * t
             if 4 * kicked > grains:
                 for p in range(pairs):
-                    _refresh(
-                        p,
-                        inner_first,
-                        inner_second,
-                        inner_x,
-                        inner_y,
-                        inner_touch,
-                        x,
-                        y,
-                        vx,
-                        vy,
-                        shear_rate,
-                        parabola,
-                    )
+                    _refresh(p, near, x, y, vx, vy, shear_rate, parabola)
             else:
                 for h in range(kicked):
                     link = chain_heads[moved[h]]
                     while link >= 0:
-                        _refresh(
-                            link >> 1,
-                            inner_first,
-                            inner_second,
-                            inner_x,
-                            inner_y,
-                            inner_touch,
-                            x,
-                            y,
-                            vx,
-                            vy,
-                            shear_rate,
-                            parabola,
-                        )
+                        _refresh(link >> 1, near, x, y, vx, vy, shear_rate, parabola)
                         link = chain[link]
             rate = 2.0 * fastest * (1.0 + abs(shear_rate) * t) + abs(shear_rate) * (
                 largest + inner_skin
@@ -754,7 +628,7 @@ def _run(
         y[i] += vy[i] * t
     tilt += outer_strain + shear_rate * t
     tilt -= math.floor(tilt + 0.5)
-    return tilt, done, outer
+    return tilt, done, found
 
 
 def advance(
@@ -797,14 +671,12 @@ def advance(
     if side <= 4.0 * radii.max():
         raise ValueError("the cell must be wider than two of the largest grains: use more grains")
     vx += shear_rate * y
-    sums = np.zeros(_SIZE)
-    law = float(restitution), float(timestep), float(activation), float(tolerance)
+    sums = np.zeros(SUMS)
+    law = shear_rate, *map(float, (restitution, timestep, activation, tolerance))
     left = steps = int(steps)
     room = 12 * radii.size + 64
     while left > 0:
-        tilt, done, pairs = _run(
-            x, y, vx, vy, radii, masses, side, tilt, shear_rate, *law, left, room, sums
-        )
+        tilt, done, pairs = _run(x, y, vx, vy, radii, masses, side, tilt, law, left, room, sums)
         left -= done
         if pairs < 0:
             raise ValueError(
@@ -817,24 +689,14 @@ def advance(
     y -= rows * side
     x -= rows * tilt * side
     x -= np.floor((x - tilt * y) / side) * side
-    area, steps = side * side, max(steps, 1)
+    area, steps, kinetic = side * side, max(steps, 1), sums[KINETIC:]
     duration = area * float(timestep) * steps
     tally = Tally(
-        steps=steps,
-        impulse=sums[_IMPULSE],
-        binary_impulse=sums[_BINARY],
-        contact_stress=sums[_CXX : _CYY + 1] / duration,
-        binary_stress=sums[_BXX : _BYY + 1] / duration,
-        kinetic_stress=sums[_KXX : _KYY + 1] / (area * steps),
-        temperature=float((sums[_KXX] + sums[_KYY]) / (2 * radii.size * steps)),
-        contacts=int(sums[_CONTACTS]),
-        collisions=int(sums[_COLLISIONS]),
-        solves=int(sums[_SOLVES]),
-        sweeps=int(sums[_SWEEPS]),
-        updates=int(sums[_UPDATES]),
-        unconverged=int(sums[_UNCONVERGED]),
-        largest_overlap=float(sums[_OVERLAP]),
-        outer_rebuilds=int(sums[_OUTER]),
-        inner_rebuilds=int(sums[_INNER]),
+        impulse=sums[IMPULSE],
+        binary_impulse=sums[BINARY],
+        contact_stress=sums[CONTACT_STRESS:BINARY_STRESS] / duration,
+        binary_stress=sums[BINARY_STRESS:KINETIC] / duration,
+        kinetic_stress=kinetic / (area * steps),
+        temperature=float((kinetic[0] + kinetic[2]) / (2 * radii.size * steps)),
     )
     return np.stack([x, y], 1), np.stack([vx, vy], 1), tilt, tally
