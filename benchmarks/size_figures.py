@@ -15,19 +15,16 @@ from jaxgran.plotting.style import (
     styled,
 )
 
-WAVE_FLOWS = (
-    (0.1, 0.3),
-    (0.2, 0.6),
-    (0.8, 0.2),
-    (0.8, 0.6),
-    (0.95, 0.1),
-    (0.95, 0.6),
-)  # of the figure of waves
 SIZE_FLOWS = ((0.1, 0.3), (0.2, 0.6), (0.5, 0.6), (0.8, 0.6), (0.2, 0.75), (0.8, 0.82))
+WAVE_FLOWS = ((0.1, 0.3), (0.2, 0.6), (0.8, 0.2), (0.8, 0.6), (0.95, 0.1), (0.95, 0.6))
 PANELS = {
     "pressure": "(a) pressure",
     "granular_temperature": "(b) granular temperature",
     "local_granular_temperature": "(c) local temperature",
+}
+WAVES = {
+    "transverse": "energy of velocity across $k$\nover that of equipartition",
+    "density": "structure factor $S(k)$",
 }
 
 
@@ -71,20 +68,13 @@ def draw_waves(rows: list[dict]) -> Figure:
     chosen = [row for row in largest if flow_of(row) in WAVE_FLOWS] or largest
     figure = Figure(figsize=(TWO_COLUMNS, 2.9), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True)
-    for row, style in zip(chosen, curve_styles(len(chosen)), strict=True):
-        style |= {"markersize": 3, "linewidth": 1, "label": flow_name(*flow_of(row))}
-        for axes, name in zip(panels, ("transverse", "density"), strict=True):
-            axes.plot(row["spectrum"]["wave_number"], row["spectrum"][name], **style)
-    labels = (
-        "energy of velocity across $k$\nover that of equipartition",
-        "structure factor $S(k)$",
-    )
-    for axes, label in zip(panels, labels, strict=True):
+    for axes, (name, label) in zip(panels, WAVES.items(), strict=True):
+        for row, style in zip(chosen, curve_styles(len(chosen)), strict=True):
+            look = style | {"markersize": 3, "linewidth": 1, "label": flow_name(*flow_of(row))}
+            axes.plot(row["spectrum"]["wave_number"], row["spectrum"][name], **look)
         axes.set(xscale="log", yscale="log", xlabel=r"wave number $k$ ($1/\sigma$)", ylabel=label)
         axes.axhline(1, color="0.6", linewidth=0.8)
     label_log_axis(panels[1].yaxis)
-    handles, names = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, names, loc="outside lower center", ncols=3, fontsize=SMALL_SIZE, frameon=False
-    )
+    place = {"loc": "outside lower center", "ncols": 3, "fontsize": SMALL_SIZE}
+    figure.legend(*panels[0].get_legend_handles_labels(), frameon=False, **place)
     return figure
