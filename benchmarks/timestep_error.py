@@ -9,18 +9,17 @@ its standard error over all seeds.
     python -m benchmarks timestep_error --quick   # two flows, under a minute
 """
 
-import multiprocessing
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 import jaxgran as jg
+from benchmarks.cores import on_all_cores
 from benchmarks.output import Output
 from benchmarks.timestep_study import START, samples_by_timestep
-from jaxgran.environment import usable_cores
 from jaxgran.sampling.sample import estimates
 from jaxgran.sampling.timestep import deepest_overlap, stress_error
 
@@ -57,16 +56,10 @@ def run(output: Output) -> None:
     plan = QUICK if output.quick else FULL
     flows = list(product(plan.packing_fraction, plan.restitution))
     tasks = [(*flow, seed) for flow in flows for seed in range(plan.seeds)]
-    dear_first = sorted(tasks, key=lambda task: (-task[0], task[1]))
-    with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
-        parts, done = pool.map(samples, [plan] * len(tasks), dear_first), {}
-        for task, part in zip(dear_first, parts, strict=True):
-            done[task] = part
-            print("ν {:g}, α {:g}, seed {}".format(*task), flush=True)
-    rows = []
+    sampled = on_all_cores(partial(samples, plan), tasks, lambda task: (task[0], -task[1]))
+    done, rows = dict(zip(tasks, sampled, strict=True)), []
     for nu, alpha in flows:
-        seeds = [done[nu, alpha, seed] for seed in range(plan.seeds)]
-        rows += rows_of_flow(plan, alpha, nu, seeds)
+        rows += rows_of_flow(alpha, nu, [done[nu, alpha, seed] for seed in range(plan.seeds)])
     output.write_rows("timestep_error", {"plan": plan._asdict()}, "rows", rows)
 
 
@@ -95,47 +88,34 @@ def verdicts(rows: Sequence[Mapping], grains: int) -> dict:
 def samples(plan: Plan, task: tuple[float, float, int]) -> dict[float, jg.Sample]:
     """A sample of every time step of one seed of a flow."""
     nu, alpha, seed = task
+    print(f"ν {nu:g}, α {alpha:g}, seed {seed}", flush=True)
     flow = jg.ShearFlow(plan.grains, alpha, nu, START)
     return samples_by_timestep(flow, seed, plan.timesteps, RELAXATION, plan.strain)
 
 
-def rows_of_flow(
-    plan: Plan, alpha: float, nu: float, seeds: Sequence[dict[float, jg.Sample]]
-) -> list[dict]:
-    """Pressure and its error at every time step of a flow, and what its samples know of the
-    step.
+def rows_of_flow(alpha: float, nu: float, seeds: Sequence[dict[float, jg.Sample]]) -> list[dict]:
+    """The error of the pressure at every time step of a flow, and what its samples know of the
+    step: temperature, the share of deep contacts, and the mean overlap.
     """
-    finest = min(plan.timesteps)
-    measured = {dt: estimates([seed[dt] for seed in seeds]) for dt in plan.timesteps}
-    truth, its_error = (float(x["pressure"]) for x in measured[finest])
+    measured = {dt: estimates([seed[dt] for seed in seeds]) for dt in sorted(seeds[0])[::-1]}
+    pressures = {dt: [float(x["pressure"]) for x in both] for dt, both in measured.items()}
+    truth, its_error = pressures[min(pressures)]
     rows = []
-    for dt in plan.timesteps:
-        value, error = measured[dt]
-        tallies = [seed[dt].tally for seed in seeds]
-
-        def total(name: str, tallies: list = tallies) -> float:
-            return float(sum(np.sum(getattr(tally, name)) for tally in tallies))
-
-        pressure, stderr = float(value["pressure"]), float(error["pressure"])
+    for dt, (pressure, stderr) in pressures.items():
+        deep, overlap, contacts = (
+            float(sum(np.sum(getattr(seed[dt].tally, name)) for seed in seeds))
+            for name in ("deep_contacts", "overlap", "contacts")
+        )
         rows.append(
             {
                 "restitution": alpha,
                 "packing_fraction": nu,
                 "timestep": dt,
-                "pressure": pressure,
-                "stderr": stderr,
-                "shear_stress": float(value["shear_stress"]),
-                "shear_stderr": float(error["shear_stress"]),
-                "temperature": float(value["granular_temperature"]),
+                "temperature": float(measured[dt][0]["granular_temperature"]),
                 "error": pressure / truth - 1,
                 "error_stderr": np.hypot(stderr / pressure, its_error / truth).item(),
-                "deep_share": total("deep_contacts") / total("contacts"),
-                "mean_overlap": total("overlap") / total("contacts"),
-                "largest_overlap": max(float(np.max(x.largest_overlap)) for x in tallies),
-                "contacts": total("contacts") / total("steps"),
-                "loaded": total("loaded_contacts") / total("steps"),
-                "collisions": total("collisions") / total("steps"),
-                "force_ratio": float(value["force_ratio"]),
+                "deep_share": deep / contacts,
+                "mean_overlap": overlap / contacts,
             }
         )
     return rows

@@ -14,11 +14,9 @@ freedom (at least one), joined over fits that take in one time step less and one
     python -m benchmarks timestep_study --quick   # two flows down to 1e-4, under a minute
 """
 
-import multiprocessing
-import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -31,8 +29,8 @@ from matplotlib.lines import Line2D
 from scipy.optimize import minimize_scalar
 
 import jaxgran as jg
+from benchmarks.cores import on_all_cores
 from benchmarks.output import Output
-from jaxgran.environment import usable_cores
 from jaxgran.plotting.style import RATIO_LABEL, TWO_COLUMNS, styled
 from jaxgran.sampling.sample import estimates
 
@@ -76,32 +74,17 @@ def run(output: Output) -> None:
     plan = QUICK if output.quick else FULL
     flows = list(product(plan.packing_fraction, plan.restitution))
     tasks = [(*flow, rule, seed) for flow in flows for rule in RULES for seed in range(plan.seeds)]
-    dear_first = sorted(tasks, key=lambda task: (-task[0], task[1]))
-    start = time.perf_counter()
-    with ProcessPoolExecutor(
-        min(usable_cores(), len(tasks)), multiprocessing.get_context("spawn")
-    ) as pool:
-        done = dict(
-            zip(dear_first, pool.map(samples, [plan] * len(tasks), dear_first), strict=True)
-        )
-    results = []
+    sampled = on_all_cores(partial(samples, plan), tasks, lambda task: (task[0], -task[1]))
+    done, results = dict(zip(tasks, sampled, strict=True)), []
     for nu, alpha in flows:
         points = {
             rule: curve(plan, [done[nu, alpha, rule, seed] for seed in range(plan.seeds)])
             for rule in RULES
         }
-        results.append(
-            {"packing_fraction": nu, "restitution": alpha, "points": points, **extrapolated(points)}
-        )
-        limit = "dt → 0: {best:.4g}, between {low:.4g} and {high:.4g}".format(
-            **results[-1]["limit"]
-        )
-        exponents = ", ".join(
-            f"{rule} {power:.2f}" for rule, power in results[-1]["exponents"].items()
-        )
-        print(f"ν {nu:g}, α {alpha:g}: {limit}; exponents: {exponents}")
-    head = {"plan": plan._asdict(), "wall_seconds": time.perf_counter() - start}
-    output.write_json("timestep_study", {**head, "flows": results})
+        about = {"packing_fraction": nu, "restitution": alpha}
+        results.append(about | {"points": points} | extrapolated(points))
+        print({name: x for name, x in results[-1].items() if name != "points"})
+    output.write_json("timestep_study", {"plan": plan._asdict(), "flows": results})
     output.write_picture(draw(results), "timestep_study")
 
 
@@ -130,22 +113,14 @@ def samples_by_timestep(
 
 
 def curve(plan: Plan, seeds: list[dict[float, jg.Sample]]) -> list[dict]:
-    """Force ratio and pressure with their standard errors, and the status, of every time step, the
-    finest first.
-    """
+    """Force ratio with its standard error, and the status, of every time step, the finest first."""
     points = []
     for timestep in sorted(plan.timesteps):
         value, error = estimates([seed[timestep] for seed in seeds])
         status = max(int(seed[timestep].status) for seed in seeds)
-        points.append(
-            {
-                "timestep": timestep,
-                "force_ratio": float(value["force_ratio"]),
-                "stderr": float(error["force_ratio"]),
-                "pressure": [float(value["pressure"]), float(error["pressure"])],
-                "status": jg.Status(status).name,
-            }
-        )
+        ratio, stderr = float(value["force_ratio"]), float(error["force_ratio"])
+        point = {"timestep": timestep, "force_ratio": ratio, "stderr": stderr}
+        points.append(point | {"status": jg.Status(status).name})
     return points
 
 
@@ -157,12 +132,10 @@ def extrapolated(points: dict[str, list[dict]]) -> dict:
     tried = [n for n in (usual - 1, usual, usual + 1) if FEWEST_FITTED <= n <= length]
     fits = {n: joint_fit([tuple(values[:n] for values in part) for part in data]) for n in tried}
     (best, _, _), exponents = fits[usual]
-    low, high = (
-        min(limit[1] for limit, _ in fits.values()),
-        max(limit[2] for limit, _ in fits.values()),
-    )
+    low = min(limit[1] for limit, _ in fits.values())
+    high = max(limit[2] for limit, _ in fits.values())
     limit = {"best": 1 + best, "low": 1 + low, "high": 1 + high}
-    return {"limit": limit, "exponents": dict(zip(RULES, exponents, strict=True)), "fitted": usual}
+    return {"limit": limit, "exponents": dict(zip(RULES, exponents, strict=True))}
 
 
 def arrays(points: list[dict]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -212,6 +185,7 @@ def power_law(dt: np.ndarray, excess: np.ndarray, error: np.ndarray) -> tuple[fl
 
 
 LEAST = 1e-5  # smallest excess that is drawn
+LOOKS = (("black", "o"), ("tab:blue", "s"), ("tab:red", "D"))  # in the order of the restitutions
 
 
 @styled
@@ -225,40 +199,26 @@ def draw(flows: list[dict]) -> Figure:
     figure = Figure(figsize=(TWO_COLUMNS, 3.4), layout="constrained")
     panels = figure.subplots(1, len(fractions), sharey=True, squeeze=False)[0]
     for axes, nu in zip(panels, fractions, strict=True):
-        curves = sorted(
-            (f for f in flows if f["packing_fraction"] == nu), key=lambda f: -f["restitution"]
-        )
-        for flow in curves:
-            k = restitutions.index(flow["restitution"])
-            style = {
-                "color": ("black", "tab:blue", "tab:red")[k % 3],
-                "marker": "osD"[k % 3],
-                "markersize": 3.5,
-            }
+        curves = [flow for flow in flows if flow["packing_fraction"] == nu]
+        for place, flow in enumerate(sorted(curves, key=lambda f: -f["restitution"])):
+            colour, marker = LOOKS[restitutions.index(flow["restitution"])]
+            style = {"color": colour, "marker": marker, "markersize": 3.5}
             for rule, points in flow["points"].items():
                 dt, excess, error = arrays(points)
                 shown = excess > LEAST
-                lower = np.minimum(error, excess - LEAST)
-                touching = (
-                    {"linestyle": "--", "markerfacecolor": "white"} if rule == "touching" else {}
-                )
-                axes.errorbar(
-                    dt[shown],
-                    excess[shown],
-                    [lower[shown], error[shown]],
-                    label=rf"$\alpha={flow['restitution']:g}$, {rule}",
-                    **{**style, "linestyle": "-", **touching},
-                )
+                bars = [np.minimum(error, excess - LEAST)[shown], error[shown]]
+                look = {"linestyle": "-"} | style
+                if rule == "touching":
+                    look |= {"linestyle": "--", "markerfacecolor": "white"}
+                look["label"] = rf"$\alpha={flow['restitution']:g}$, {rule}"
+                axes.errorbar(dt[shown], excess[shown], bars, **look)
                 bad = np.array([p["status"] != "ok" for p in points]) & shown
                 axes.plot(dt[bad], excess[bad], "x", color="0.4", markersize=7, zorder=4)
-            draw_limit(axes, flow["limit"], dt.min() / (2.2 + 1.3 * curves.index(flow)), style)
+            draw_limit(axes, flow["limit"], dt.min() / (2.2 + 1.3 * place), style)
         axes.axvline(dt.min() / 1.6, color="0.7", linewidth=0.8)
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_ylim(LEAST / 1.6, 30)
+        axes.set(xscale="log", yscale="log", ylim=(LEAST / 1.6, 30), title=rf"$\nu={nu:g}$")
         axes.set_xticks([10.0**k for k in range(round(np.log10(dt.min())), -1)])
         axes.text(dt.min() / 3, 8, r"$\mathrm{d}t\to 0$", ha="center")
-        axes.set_title(rf"$\nu={nu:g}$")
         axes.set_xlabel(r"time step $\mathrm{d}t$ ($1/\dot\gamma$)")
     panels[0].set_ylabel(f"excess of the {RATIO_LABEL} $- 1$")
     handles, labels = panels[0].get_legend_handles_labels()
