@@ -16,7 +16,8 @@ step give the force ratio at other time steps.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,9 @@ import xarray as xr
 from scipy.optimize import minimize
 
 import jaxgran as jg
-from benchmarks.dissipation import areas
+from benchmarks.dissipation import areas, rms
 from benchmarks.output import RESULTS, Output
-from benchmarks.reference_figure import BINARY, draw
+from benchmarks.reference_figure import BINARY, RIGHT, draw
 from benchmarks.reference_map import PLANE, reference_points
 from jaxgran.maps.schema import flattened
 from jaxgran.model.choices import HALF_INTERVAL
@@ -79,17 +80,11 @@ def run(output: Output) -> None:
     )
     rows = list(judged(table, fresh["rows"]))
     head = {"table": table.head, "left_out": left_out(table), "plane": plane(table)}
-    head |= {
-        "fresh": {key: fresh[key] for key in ("points", "grains", "timestep")},
-        "coverage": coverage(rows),
-        "large": {"grains": large["grains"], "rows": list(judged(table, large["rows"]))},
-    }
-    head |= {"whole_errors": whole_errors(table)}
-    for name, values in (
-        head["left_out"] | {f"fresh {key}": share for key, share in head["coverage"].items()}
-    ).items():
-        print(name, values)
-    print(head["plane"])
+    head["fresh"] = {key: fresh[key] for key in ("points", "grains", "timestep")}
+    head["coverage"] = coverage(rows)
+    head["large"] = {"grains": large["grains"], "rows": list(judged(table, large["rows"]))}
+    head["whole_errors"] = whole_errors(table)
+    print(*(f"{name}: {x}" for name, x in head.items() if name != "table"), sep="\n")
     output.write_rows("reference", head, "rows", rows)
     output.write_picture(draw(table), "reference")
 
@@ -106,8 +101,7 @@ def make_table(
     finite = np.flatnonzero(np.isfinite(flat["pressure"].values))
     flat = flat.isel(point=finite)
     columns = {name: flat[name].values for name in ("restitution", "packing_fraction")}
-    where = *columns.values(), flat["point_grains"].values
-    columns["grains"] = where[-1]
+    grains = columns["grains"] = flat["point_grains"].values
     paths = {name: name for name in (*MEASURED, RATIO)} | {
         "dissipation_rate": "stresses/dissipation_rate"
     }
@@ -119,55 +113,43 @@ def make_table(
             columns |= of_large_system(flat, name, path)
     for other in others:
         name = f"{RATIO}_at_{float(other.attrs['timestep']):g}"
-        plane = {axis: data[axis].values for axis in ("packing_fraction", "restitution")}
-        near = other[[*_columns(RATIO), f"{RATIO}_stderr"]].reindex(
-            plane, method="nearest", tolerance=1e-6
-        )
-        at_points = near.stack(point=("packing_fraction", "restitution")).isel(point=finite)
-        ratio = of_large_system(at_points, RATIO, RATIO)
+        axes = {axis: data[axis].values for axis in ("packing_fraction", "restitution")}
+        near = other[[*_columns(RATIO), f"{RATIO}_stderr"]]
+        near = near.reindex(axes, method="nearest", tolerance=1e-6).stack(point=tuple(axes))
+        ratio = of_large_system(near.isel(point=finite), RATIO, RATIO)
         value, stderr = ratio[RATIO], ratio[f"{RATIO}_stderr"]
         # a ratio of 1 in all blocks has no error, and so no weight on a surface
         columns |= {name: np.where(np.isfinite(stderr), value, np.nan), f"{name}_stderr": stderr}
         paths[name] = RATIO
     theory, within = best_theory(columns)
     series = chebyshev_series(theory, columns)
-    terms = {
+    about = {
+        "contents": "Chebyshev series of ln(prediction) in sqrt(1 - alpha) and nu, see table.py",
+        "theory": theory.__name__,
         "low": " ".join(f"{x:.12g}" for x in series.low),
         "high": " ".join(f"{x:.12g}" for x in series.high),
     }
-    first, second = (x.ravel() for x in np.indices((TERMS, TERMS)))
-    table_of_terms = {
-        "first": first,
-        "second": second,
-        **{k: v.ravel() for k, v in series.coefficients.items()},
-    }
-    about = {
-        "contents": "Chebyshev series of ln(prediction) in sqrt(1 - alpha) and nu, see table.py"
-    }
-    write_columns(
-        folder / "theory.csv", about | {"theory": theory.__name__} | terms, table_of_terms, digits=9
-    )
-    attributes = {
-        name: data.attrs[name] for name in ("timestep", "seeds", "polydispersity", "activation")
-    }
+    first, second = np.indices((TERMS, TERMS))
+    terms = {"first": first, "second": second, **series.coefficients}
+    terms = {name: x.ravel() for name, x in terms.items()}
+    write_columns(folder / "theory.csv", about, terms, digits=9)
     head: dict[str, Any] = {
         "contents": "averages of the reference map of jaxgran in units of m, sigma and 1/shear "
         "rate, see table.py",
-        "grains": f"{where[-1].min()} to {where[-1].max()}, extrapolated to a large system",
-        **{name: f"{x:g}" if isinstance(x, float) else str(x) for name, x in attributes.items()},
-        "map commit": data.attrs["commit"],
-        **made_from,
-        **{
-            f"share of the points, by area, with the pressure of {name} within 10 %": f"{x:.3f}"
-            for name, x in within.items()
-        },
+        "grains": f"{grains.min()} to {grains.max()}, extrapolated to a large system",
     }
+    for name in ("timestep", "seeds", "polydispersity", "activation"):
+        value = data.attrs[name]
+        head[name] = f"{value:g}" if isinstance(value, float) else str(value)
+    head |= {"map commit": data.attrs["commit"], **made_from}
+    for name, share in within.items():
+        about = f"share of the points, by area, with the pressure of {name} within 10 %"
+        head[about] = f"{share:.3f}"
     bare = Table({}, columns, series)
     for name in paths:
         shape = fitted_shape(bare, name)
-        head[f"surface {name}"] = " ".join(
-            f"{x:.5g}" for x in (shape.amplitude, *shape.lengths, shape.noise, shape.leave_one_out)
-        )
+        numbers = shape.amplitude, *shape.lengths, shape.noise, shape.leave_one_out
+        head[f"surface {name}"] = " ".join(f"{x:.5g}" for x in numbers)
     write_columns(folder / "averages.csv", head, columns)
 
 
@@ -182,12 +164,9 @@ def of_large_system(flat: xr.Dataset, name: str, path: str) -> dict[str, np.ndar
     value = large if name == RATIO else flat[path] * slope
     squares = errors**2
     others = squares.sel(error_source="total") - squares.sel(error_source="sampling")
-    bound = np.sqrt(others) * value / large
-    return {
-        name: value.values,
-        f"{name}_stderr": (flat[f"{path}_stderr"] * slope).values,
-        f"{name}_bound": bound.values,
-    }
+    found = {"": value, "_stderr": flat[f"{path}_stderr"] * slope}
+    found["_bound"] = np.sqrt(others) * value / large
+    return {f"{name}{end}": x.values for end, x in found.items()}
 
 
 def _columns(average: str) -> tuple[str, str]:
@@ -201,10 +180,9 @@ def best_theory(columns: dict[str, np.ndarray]) -> tuple[Callable, dict[str, flo
     flows = columns["restitution"], columns["packing_fraction"]
     weights, within = areas(*flows), {}
     for name, theory in THEORIES.items():
-        predicted = np.asarray(
-            jax.vmap(lambda *flow, theory=theory: theory(*flow).pressure)(*flows)
-        )
-        within[name] = float(np.mean(weights * (np.abs(predicted / columns["pressure"] - 1) < 0.1)))
+        predicted = jax.vmap(lambda *flow, theory=theory: theory(*flow).pressure)(*flows)
+        error = np.asarray(predicted) / columns["pressure"] - 1
+        within[name] = float(np.mean(weights * (np.abs(error) < 0.1)))
     return THEORIES[max(within, key=within.__getitem__)], within
 
 
@@ -219,12 +197,11 @@ def chebyshev_series(theory: Callable, columns: dict[str, np.ndarray]) -> Series
     nodes = np.cos(np.pi * (np.arange(TERMS) + 0.5) / TERMS)
     first, second = (low[k] + (nodes + 1) / 2 * (high[k] - low[k]) for k in (0, 1))
     u, v = (x.ravel() for x in np.meshgrid(first, second, indexing="ij"))
-    predicted = jax.vmap(theory)(1 - u**2, v)
     inverse = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, TERMS - 1))
+    plain, corrected = (jax.vmap(f)(1 - u**2, v) for f in (theory, corrected_shear))
     coefficients = {}
-    mended = jax.vmap(corrected_shear)(1 - u**2, v)
     for name in THEORY:
-        for start, averages in (("", predicted), (CORRECTED, mended)):
+        for start, averages in (("", plain), (CORRECTED, corrected)):
             values = np.log(np.asarray(getattr(averages, name))).reshape(TERMS, TERMS)
             coefficients[f"{start}{name}"] = inverse @ values @ inverse.T
     return Series(low, high, coefficients)
@@ -242,25 +219,17 @@ def fitted_shape(table: Table, name: str) -> Shape:
         return Shape(float(amplitude), (float(first), float(second)), float(noise))
 
     def cost(logs: np.ndarray) -> float:
-        likelihood = type(surface)(
-            surface.points, surface.values, surface.stderrs, with_shape(logs)
-        ).log_likelihood()
+        likelihood = replace(surface, shape=with_shape(logs)).log_likelihood()
         return -likelihood + float(np.sum(((logs - priors) / widths) ** 2)) / 2
 
     enough = {"xatol": 0.02, "fatol": 0.02}
-    best = min(
-        (minimize(cost, start, method="Nelder-Mead", options=enough) for start in START),
-        key=lambda fit: fit.fun,
-    )
-    shape = with_shape(best.x)
-    errors, expected = type(surface)(
-        surface.points, surface.values, surface.stderrs, shape
-    ).left_out()
-    scatter = float(np.sqrt(np.mean((errors / expected) ** 2)))
-    return Shape(shape.amplitude, shape.lengths, shape.noise, max(1.0, scatter))
+    fits = [minimize(cost, start, method="Nelder-Mead", options=enough) for start in START]
+    shape = with_shape(min(fits, key=lambda fit: fit.fun).x)
+    errors, expected = replace(surface, shape=shape).left_out()
+    return replace(shape, leave_one_out=max(1.0, rms(errors / expected)))
 
 
-# --------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 # intervals
 
 
@@ -269,11 +238,8 @@ def left_out(table: Table) -> dict[str, dict[str, float]]:
     result = {}
     for name, surface in table.surfaces.items():
         errors, expected = surface.left_out()
-        result[name] = {
-            "rms": round(float(np.sqrt(np.mean(errors**2))), 4),
-            "noise": round(float(np.sqrt(np.mean(surface.stderrs**2))), 4),
-            "covered": round(float(np.mean(np.abs(errors) < HALF_INTERVAL * expected)), 3),
-        }
+        covered = np.mean(np.abs(errors) < HALF_INTERVAL * expected)
+        result[name] = {"rms": round(rms(errors), 4), "covered": round(float(covered), 3)}
     return result
 
 
@@ -294,7 +260,7 @@ def whole_errors(table: Table) -> dict[str, Any]:
     return result
 
 
-def judged(table: Table, rows: list[dict[str, Any]]) -> Any:
+def judged(table: Table, rows: list[dict[str, Any]]) -> Iterator[dict[str, float]]:
     """For every fresh flow, ln(measured/table) of every average and the half-widths of its two
     intervals.
 
@@ -304,27 +270,20 @@ def judged(table: Table, rows: list[dict[str, Any]]) -> Any:
     interval tests this law.
     """
     for row in rows:
-        where = coordinates(row["restitution"], row["packing_fraction"])
-        comparison = {
-            "restitution": row["restitution"],
-            "packing_fraction": row["packing_fraction"],
-        }
+        flow = row["restitution"], row["packing_fraction"]
+        where = coordinates(*flow)
+        comparison = dict(zip(("restitution", "packing_fraction"), flow, strict=True))
         for name in MEASURED:
             log, stderr = table.surfaces[name](where)
             bounded = BOUNDED_BY.get(name, name)
-            missing = SIZE_LAWS[bounded].missing(
-                row["restitution"], row["packing_fraction"], row["grains"]
-            )
+            missing = SIZE_LAWS[bounded].missing(*flow, row["grains"])
             expected = log + table.series(where)[theory_of(name)] + np.log1p(-missing)
             known = [row[f"{bounded}_{part}"] / row[bounded] for part in ("timestep", "tolerance")]
             own = np.hypot(HALF_INTERVAL * row[f"{name}_stderr"] / row[name], np.hypot(*known))
             narrow = np.hypot(HALF_INTERVAL * stderr, own)
             whole = np.hypot(narrow, np.exp(table.bounds[name](where)[0]))
-            values = np.log(row[name]) - expected, narrow, whole
-            comparison |= {
-                f"{name}{end}": round(float(x), 5)
-                for end, x in zip(("", "_narrow", "_whole"), values, strict=True)
-            }
+            values = {"": np.log(row[name]) - expected, "_narrow": narrow, "_whole": whole}
+            comparison |= {f"{name}{end}": round(float(x), 5) for end, x in values.items()}
         yield comparison
 
 
@@ -337,63 +296,28 @@ def coverage(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
         apart, narrow, whole = (
             np.array([row[f"{name}{end}"] for row in rows]) for end in ("", "_narrow", "_whole")
         )
-        result[name] = {
-            "covered": round(float(np.mean(np.abs(apart) < whole)), 3),
-            "covered_narrow": round(float(np.mean(np.abs(apart) < narrow)), 3),
-            "mean": round(float(np.mean(apart)), 4),
-            "rms": round(float(np.sqrt(np.mean(apart**2))), 4),
-            "rms_in_standard_errors": round(
-                HALF_INTERVAL * float(np.sqrt(np.mean((apart / narrow) ** 2))), 3
-            ),
-            "median_half_width": round(float(np.median(whole)), 4),
+        numbers = {
+            "covered": (np.mean(np.abs(apart) < whole), 3),
+            "covered_narrow": (np.mean(np.abs(apart) < narrow), 3),
+            "mean": (np.mean(apart), 4),
+            "rms": (rms(apart), 4),
+            "rms_in_standard_errors": (HALF_INTERVAL * rms(apart / narrow), 3),
+            "median_half_width": (np.median(whole), 4),
         }
+        result[name] = {key: round(float(x), digits) for key, (x, digits) in numbers.items()}
     return result
 
 
-# ------------------------------------------------------------------------------------------------
-# plane
-
-
 def plane(table: Table) -> dict[str, Any]:
-    """Shares of the plane of ln(1 − α) and ν, and of its binary part, where the theory's pressure
-    is within limits.
-
-    In the binary part the force ratio is below 1.05. Its worst point is that of the map with the
-    lowest prediction.
+    """Number of points, and the shares of the plane of ln(1 − α) and ν, and of its binary part,
+    where the theory's pressure is within 10 %. In the binary part the force ratio is below 1.05.
     """
-    alphas, nus = table.columns["restitution"], table.columns["packing_fraction"]
-    x, y = (
-        np.linspace(*np.log(1 - np.array(table.range("restitution"))), 200),
-        np.linspace(*table.range("packing_fraction"), 200),
-    )
+    x = np.linspace(*np.log(1 - np.array(table.range("restitution"))), 200)
+    y = np.linspace(*table.range("packing_fraction"), 200)
     where = coordinates(*np.meshgrid(1 - np.exp(x), y))
-    over, half = table.log_estimate("pressure", where)
-    points = coordinates(alphas, nus)
-    error = np.exp(table.series(points)["pressure"]) / table.columns["pressure"] - 1
-    worst = int(np.argmin(np.where(table.columns[RATIO] < 1 + BINARY, error, np.inf)))
+    over, _ = table.log_estimate("pressure", where)
+    inside = np.abs(np.expm1(-over)) <= RIGHT
     binary = excess_from_surface(table.surfaces[RATIO](where)[0]) < BINARY
-    result: dict[str, Any] = {}
-    for limit in (0.05, 0.10):
-        low, high = (np.abs(np.expm1(-(over + shift))) for shift in (-half, half))
-        outside = np.abs(np.expm1(-over)) > limit
-        share = {
-            "share": 1 - np.mean(outside),
-            "share_at_least": np.mean((low < limit) & (high < limit)),
-            "share_at_most": np.mean(
-                (low < limit) | (high < limit) | ~outside | ((over - half) * (over + half) < 0)
-            ),
-            "share_of_binary": np.mean(~outside[binary]),
-        }
-        result[f"{limit:g}"] = {name: round(float(x), 3) for name, x in share.items()}
-    return result | {
-        "points": len(alphas),
-        "fewest_grains": int(table.columns["grains"].min()),
-        "most_grains": int(table.columns["grains"].max()),
-        "share_binary": round(float(binary.mean()), 3),
-        "worst_binary": {
-            "restitution": float(alphas[worst]),
-            "packing_fraction": float(nus[worst]),
-            "error": round(float(error[worst]), 3),
-            "force_ratio": float(table.columns["force_ratio"][worst]),
-        },
-    }
+    share, of_binary = (round(float(np.mean(part)), 3) for part in (inside, inside[binary]))
+    points = len(table.columns["restitution"])
+    return {"points": points, f"{RIGHT:g}": {"share": share, "share_of_binary": of_binary}}

@@ -22,7 +22,6 @@ force ratio.
     python -m benchmarks reference_map --quick       # 3 × 3 points of 64 and 100 grains, a minute
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -45,26 +44,62 @@ DENSER = (0.78, 0.79, 0.8, 0.81, 0.82)
 DENSE = (*BETWEEN, *DENSER, 0.83)
 
 
-def plane(quick: bool) -> dict[str, dict[str, Any]]:
-    """The arguments of ``ratio_map`` for one seed."""
-    alphas, loose, dense = (
-        ((0.1, 0.5, 0.9), (0.5, 0.7), (0.8,)) if quick else (RESTITUTIONS, LOOSE, DENSE)
-    )
-    sizes = (100, 64) if quick else (6400, 1600)
-    grains = [
-        size for nus, size in zip((loose, dense), sizes, strict=True) for _ in nus for _ in alphas
-    ]
-    return {"plane": grid(quick, alphas, loose + dense, grains_by_point=grains)}
+def grid(alphas: Any, nus: Any, grains: Any, timestep: float) -> dict[str, Any]:
+    """The arguments of ``ratio_map`` for a grid of flows, all with the same numbers of grains."""
+    axes = {"restitution": alphas, "packing_fraction": nus}
+    return axes | {"grains": grains, "timestep": timestep}
 
 
-def grid(
-    quick: bool, alphas: Sequence[float], nus: Sequence[float], **grains: int | Sequence[int]
-) -> dict[str, Any]:
-    """The arguments of ``ratio_map`` for restitutions and packing fractions at the time step of the
-    plane.
-    """
-    timestep = 5e-4 if quick else 1e-4
-    return {"restitution": alphas, "packing_fraction": nus, "timestep": timestep, **grains}
+def plane(alphas: Any, loose: Any, dense: Any, grains: Any, timestep: float) -> dict[str, Any]:
+    """The same with one number of grains for loose and one for dense flows."""
+    by_point = np.repeat(grains, [len(alphas) * len(nus) for nus in (loose, dense)]).tolist()
+    axes = {"restitution": alphas, "packing_fraction": loose + dense}
+    return axes | {"grains_by_point": by_point, "timestep": timestep}
+
+
+Maps = dict[str, dict[str, Any]]  # arguments of ``ratio_map`` by the name of a map
+SEVERAL_SEEDS: dict[str, Maps] = {  # parts of ``PLANE``: the maps of one seed
+    "plane": {"plane": plane(RESTITUTIONS, LOOSE, DENSE, (6400, 1600), 1e-4)},
+    "between": {"between": grid(RESTITUTIONS, BETWEEN, 6400, 1e-4)},
+    "dense": {"dense": grid(RESTITUTIONS, DENSER, 3200, 1e-4)},
+    "dissipative": {  # where long waves are strongest
+        "dissipative": grid(RESTITUTIONS[:4], (*LOOSE, *BETWEEN[:2]), 16_000, 1e-4),
+        "dissipative_dense": grid(RESTITUTIONS[:4], BETWEEN[2:4], 16_000, 1e-4),
+        "dissipative_less": grid(RESTITUTIONS[4:7], (*LOOSE[4:], *BETWEEN[:3]), 16_000, 1e-4),
+    },
+}
+CHECKED = (0.15, 0.35, 0.6, 0.85), (0.3, 0.5, 0.65, 0.76)  # that no law of the size was fitted to
+SLOW = RESTITUTIONS[:10], (*LOOSE[2:], *DENSE[:8])  # enough for dt = 1e-3, with clusters
+PARTS: dict[str, Maps] = {
+    "sizes": {
+        "sizes_loose": grid((0.1, 0.4, 0.7), (0.2, 0.4, 0.6), (400, 1600, 6400, 25_600), 5e-4),
+        "sizes_dense": grid((0.1, 0.5, 0.9), (0.7, 0.74, 0.77, 0.8), (400, 1600, 6400), 2e-4),
+    },
+    "check": {
+        "check_small": grid(*CHECKED, (256, 1024), 5e-4) | {"seeds": 8},
+        "check_large": grid(*CHECKED, 25_600, 5e-4),
+    },
+    "coarse": {"coarse": grid(*SLOW, 1000, 1e-3)},
+}
+QUICK: dict[str, Maps] = {
+    "plane": {"plane": plane((0.1, 0.5, 0.9), (0.5, 0.7), (0.8,), (100, 64), 5e-4)},
+    "between": {"between": grid((0.1, 0.9), (0.72,), 100, 5e-4)},
+    "dense": {"dense": grid((0.1, 0.9), (0.8,), 100, 5e-4)},
+    "dissipative": {
+        "dissipative": grid((0.1,), (0.5,), 144, 5e-4),
+        "dissipative_less": grid((0.5,), (0.7,), 144, 5e-4),
+    },
+    "sizes": {
+        "sizes_loose": grid((0.1, 0.7), (0.2, 0.6), (64, 256), 5e-4),
+        "sizes_dense": grid((0.1, 0.9), (0.7, 0.8), (64, 256), 2e-4),
+    },
+    "check": {
+        "check_small": grid(*CHECKED, (64, 100), 5e-4) | {"seeds": 8},
+        "check_large": grid(*CHECKED, 200, 5e-4),
+    },
+    "coarse": {"coarse": grid((0.1, 0.5), (0.6,), 64, 1e-3)},
+}
+Part = Literal["plane", "between", "dense", "dissipative", "sizes", "check", "coarse"]
 
 
 def reference_points() -> xr.Dataset:
@@ -101,92 +136,6 @@ def with_points(data: xr.Dataset) -> xr.Dataset:
     return points.assign(point_grains=ones * grains, point_seeds=ones * data.attrs["seeds"])
 
 
-def between(quick: bool) -> dict[str, dict[str, Any]]:
-    """The arguments of ``ratio_map`` for one seed of flows of middle density, with as many grains
-    as loose ones.
-    """
-    alphas, nus, grains = ((0.1, 0.9), (0.72,), 100) if quick else (RESTITUTIONS, BETWEEN, 6400)
-    return {"between": grid(quick, alphas, nus, grains=grains)}
-
-
-def dense(quick: bool) -> dict[str, dict[str, Any]]:
-    """The arguments of ``ratio_map`` for one seed of dense flows, with twice as many grains as in
-    the plane.
-    """
-    alphas, nus, grains = ((0.1, 0.9), (0.8,), 100) if quick else (RESTITUTIONS, DENSER, 3200)
-    return {"dense": grid(quick, alphas, nus, grains=grains)}
-
-
-def dissipative(quick: bool) -> dict[str, dict[str, Any]]:
-    """The arguments of ``ratio_map`` for one seed of flows in which long waves are strongest."""
-    planes = {
-        "dissipative": (RESTITUTIONS[:4], (*LOOSE, *BETWEEN[:2])),
-        "dissipative_dense": (RESTITUTIONS[:4], BETWEEN[2:4]),
-        "dissipative_less": (RESTITUTIONS[4:7], (*LOOSE[4:], *BETWEEN[:3])),
-    }
-    if quick:
-        planes = {"dissipative": ((0.1,), (0.5,)), "dissipative_less": ((0.5,), (0.7,))}
-    grains = 144 if quick else 16_000
-    return {name: grid(quick, *axes, grains=grains) for name, axes in planes.items()}
-
-
-def sizes(quick: bool) -> dict[str, dict[str, Any]]:
-    """The arguments of ``ratio_map`` for several numbers of grains, of loose and of dense flows."""
-    loose = {"restitution": (0.1, 0.4, 0.7), "packing_fraction": (0.2, 0.4, 0.6), "timestep": 5e-4}
-    dense = {
-        "restitution": (0.1, 0.5, 0.9),
-        "packing_fraction": (0.7, 0.74, 0.77, 0.8),
-        "timestep": 2e-4,
-    }
-    grains = (64, 256) if quick else (400, 1600, 6400, 25600)
-    return {
-        "sizes_loose": loose | {"grains": grains},
-        "sizes_dense": dense | {"grains": grains[:3]},
-    }
-
-
-def check(quick: bool) -> dict[str, dict[str, Any]]:
-    """The arguments of ``ratio_map`` for flows that no law of the size was fitted to, small and
-    large.
-    """
-    alphas, nus = (0.15, 0.35, 0.6, 0.85), (0.3, 0.5, 0.65, 0.76)
-    chosen = {"restitution": alphas, "packing_fraction": nus, "timestep": 5e-4}
-    return {
-        "check_small": chosen | {"grains": (64, 100) if quick else (256, 1024), "seeds": 8},
-        "check_large": chosen | {"grains": 200 if quick else 25_600},
-    }
-
-
-def coarse(quick: bool) -> dict[str, dict[str, Any]]:
-    """The arguments of ``ratio_map`` at dt = 1e-3, where grains are slow enough for it and clusters
-    form.
-    """
-    alphas, nus = (
-        [a for a in RESTITUTIONS if a <= 0.7],
-        [nu for nu in (*LOOSE, *DENSE) if 0.3 <= nu <= 0.79],
-    )
-    chosen: dict[str, Any] = {
-        "restitution": alphas,
-        "packing_fraction": nus,
-        "grains": 1000,
-        "timestep": 1e-3,
-    }
-    return {
-        "coarse": chosen
-        | ({"restitution": (0.1, 0.5), "packing_fraction": (0.6,), "grains": 64} if quick else {})
-    }
-
-
-SEVERAL_SEEDS = {
-    "plane": plane,
-    "between": between,
-    "dense": dense,
-    "dissipative": dissipative,
-}
-PARTS = {"sizes": sizes, "check": check, "coarse": coarse}
-Part = Literal["plane", "between", "dense", "dissipative", "sizes", "check", "coarse"]
-
-
 def run(
     output: Output, seeds: int = 2, first_seed: int = 0, part: Part = "plane", folder: Path = KEPT
 ) -> None:
@@ -195,24 +144,20 @@ def run(
         raise SystemExit(f"--seeds and --first-seed belong to {', '.join(SEVERAL_SEEDS)}.")
     folder = folder.with_name(f"{folder.name}_quick") if output.quick else folder
     folder.mkdir(parents=True, exist_ok=True)
+    maps = QUICK if output.quick else SEVERAL_SEEDS | PARTS
     command = "python -m benchmarks reference_map"
 
     def made(name: str, **chosen: Any) -> xr.DataTree:
-        kept = {
-            "output": folder / f"{name}.nc",
-            "resume": True,
-            "progress": True,
-            "attributes": {"command": command},
-        }
-        return jg.ratio_map(**{"seeds": 1, **chosen}, **kept, workers=usable_cores())
+        kept = {"output": folder / f"{name}.nc", "attributes": {"command": command}}
+        ways = {"resume": True, "progress": True, "workers": usable_cores()}
+        return jg.ratio_map(**{"seeds": 1, **chosen}, **kept, **ways)
 
     if part in SEVERAL_SEEDS:
-        chosen = SEVERAL_SEEDS[part](output.quick)
         merged = jg.merge_maps(
             [
                 made(f"{name}_{k}", **settings, first_seed=k)
                 for k in range(first_seed, first_seed + seeds)
-                for name, settings in chosen.items()
+                for name, settings in maps[part].items()
             ]
         )
         merged.attrs["command"] = (
@@ -220,5 +165,5 @@ def run(
         )
         write_dataset(merged, output.path("reference", ".nc" if part == "plane" else f"_{part}.nc"))
         return
-    for name, chosen in PARTS[part](output.quick).items():
+    for name, chosen in maps[part].items():
         write_dataset(made(name, **chosen), output.path("reference", f"_{name}.nc"))

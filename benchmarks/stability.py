@@ -20,15 +20,11 @@ are silent.
     python -m benchmarks stability --quick    # two flows of 64 grains, about two minutes
 """
 
-import json
 import math
-import multiprocessing
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -38,12 +34,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
 import jaxgran as jg
+from benchmarks.cores import on_all_cores
 from benchmarks.output import Output
 from benchmarks.peers import event_driven, lammps, numba_rival
 from benchmarks.peers.jaxgran_itself import discs_of
 from benchmarks.peers.problem import Flow, Run, Stress, averages, relative
-from jaxgran.environment import usable_cores
-from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, empty_figure, styled
+from jaxgran.plotting.style import SMALL_SIZE, TWO_COLUMNS, empty_figure, scientific, styled
 from jaxgran.sampling.averages import averages as averages_of_sums
 from jaxgran.sampling.timestep import deepest_overlap
 
@@ -128,42 +124,15 @@ class Failure(Exception):
     """The word for what ended a run."""
 
 
-def run(output: Output, folder: Path | None = None) -> None:
-    """Measure all flows on all cores, print what is found, and write JSON and PNG.
-
-    Flows that are done are kept in the folder, for a second run of the same commit.
-    """
+def run(output: Output) -> None:
+    """Measure all flows on all cores, print what is found, and write JSON and PNG."""
     plan = QUICK if output.quick else FULL
-    folder = folder or output.path(".stability", "")
-    folder.mkdir(parents=True, exist_ok=True)
-    with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
-        dense_first = sorted(plan.cases, key=lambda case: -case.packing_fraction)
-        done = {
-            case: pool.submit(kept, folder / f"{case}.json", output.hardware, plan, case)
-            for case in dense_first
-        }
-        results = [done[case].result() for case in plan.cases]
-    head = {
-        "seeds": plan.seeds,
-        "right": RIGHT,
-        "precision": PRECISION,
-        "seconds": SECONDS,
-        "timesteps_of_reference": {"stresses": REFERENCE_TIMESTEP, "force_ratio": FORCE_TIMESTEP},
-        "missing": lammps.missing(),
-        "references": [reference for reference, _ in results],
-    }
+    results = on_all_cores(partial(rows_of, plan), plan.cases, lambda case: case.packing_fraction)
     rows = [row for _, some in results for row in some]
+    head = {"seeds": plan.seeds, "right": RIGHT, "precision": PRECISION, "seconds": SECONDS}
+    head |= {"references": [reference for reference, _ in results]}
     output.write_rows("stability", head, "rows", rows)
     output.write_picture(draw(rows), "stability")
-
-
-def kept(path: Path, hardware: dict, plan: Plan, case: Case) -> tuple[dict, list[dict]]:
-    """``rows_of`` a flow, from its file where it is of the same commit and machine."""
-    if path.exists() and (known := json.loads(path.read_text()))["hardware"] == hardware:
-        return known["reference"], known["rows"]
-    found, rows = rows_of(plan, case)
-    path.write_text(json.dumps({"hardware": hardware, "reference": found, "rows": rows}))
-    return found, rows
 
 
 def case_of(row: dict) -> Case:
@@ -180,39 +149,27 @@ def rows_of(plan: Plan, case: Case) -> tuple[dict, list[dict]]:
     method, setting    –     a key of ``METHODS`` or ``PEERS``; its dt in 1/γ̇ or k in mγ̇²
     failure            –     what ended the run: a status, "too_slow", or the words of a peer
     strain             –     that was sampled, over all seeds
-    seconds            s     of processor time
     largest_overlap    σ     of a contact, by contact dynamics, and the mean in ``mean_overlap``
     pressure, …        –     relative error with its standard error, None where nothing was sampled
     =================  ====  ====================================================================
     """
     states = [start(case, seed) for seed in range(plan.seeds)]
     right = None if case.packing_fraction == JAMMED else reference(plan, case, states)
+    ways = [
+        (method, setting, partial(ContactDynamics, case, timestep=setting, **chosen))
+        for method, (settings, chosen) in METHODS.items()
+        for setting in settings
+    ] + [
+        (method, setting, partial(peer_run, peer, case, setting))
+        for method, (settings, peer) in PEERS.items()
+        if not peer.missing()
+        for setting in settings
+    ]
     rows = []
-
-    def measure(
-        method: str, setting: float, begin: "Callable[[jg.State], Run | ContactDynamics]"
-    ) -> None:
-        row = {**asdict(case), "method": method, "setting": setting}
-        row |= measured(plan, case, [partial(begin, state) for state in states], right)
-        rows.append(row)
-        print(
-            f"{case}  {method:20s}{setting:8.0e}  {row['failure'] or status_of(row) or '':16.16s}"
-            + "".join(
-                "{:8.1f} ± {:.1f} %".format(*(100 * x for x in row[name]))
-                for name in (*STRESSES, "force_ratio")
-                if row.get(name)
-            )
-            + f"  {row['largest_overlap'] or 0:.2g} σ, strain {row['strain']:.0f}"
-            + f", {row['seconds']:.0f} s",
-            flush=True,
-        )
-
-    for method, (settings, chosen) in METHODS.items():
-        for setting in settings:
-            measure(method, setting, partial(ContactDynamics, case, timestep=setting, **chosen))
-    for method, (settings, peer) in PEERS.items():
-        for setting in settings if not peer.missing() else ():
-            measure(method, setting, partial(peer_run, peer, case, setting))
+    for method, setting, begin in ways:
+        found = measured(plan, case, [partial(begin, state) for state in states], right)
+        rows.append({**asdict(case), "method": method, "setting": setting, **found})
+        print(rows[-1], flush=True)
     return {**asdict(case), **(right or {})}, rows
 
 
@@ -230,16 +187,9 @@ def reference(plan: Plan, case: Case, states: Sequence[jg.State]) -> dict[str, t
         def precise(values: dict, names: tuple[str, ...] = names) -> bool:
             return all(values[x][1] <= REFERENCE_PRECISION * abs(values[x][0]) for x in names)
 
-        blocks, seconds = _sampled(plan, runs, precise, REFERENCE_SECONDS)
-        values = averages(blocks)
+        values = averages(_sampled(plan, runs, precise, REFERENCE_SECONDS))
         found |= {name: values[name] for name in names}
-        strain = case.block * sum(map(len, blocks))
-        print(
-            f"{case}  reference {timestep:g}",
-            *(f"{name} {found[name][0]:.4g} ± {found[name][1]:.2g}" for name in names),
-            f"strain {strain:.0f}, {seconds:.0f} s",
-            flush=True,
-        )
+    print(case, "reference", found, flush=True)
     return found
 
 
@@ -252,7 +202,7 @@ def measured(
     """What a method makes of a flow: the keys of a row from ``failure`` on."""
     runs: list[Run | ContactDynamics] = []
     blocks: list[list[Stress]] = []
-    failure, seconds = None, 0.0
+    failure = None
 
     def decided(values: dict) -> bool:
         if right is None:
@@ -265,21 +215,18 @@ def measured(
     try:
         runs.extend(begin() for begin in begins)
         _warm_up(runs, case, SECONDS)
-        blocks, seconds = _sampled(plan, runs, decided, SECONDS)
+        blocks = _sampled(plan, runs, decided, SECONDS)
         if not decided(averages(blocks)):
             failure = "too_slow"
     except Failure as stopped:
         failure = str(stopped)
     except Exception as stopped:  # of a program that is not ours to mend
         failure = str(stopped) or type(stopped).__name__
-    tallies = [
-        run.tally for run in runs if isinstance(run, ContactDynamics) and run.tally is not None
-    ]
     for one in runs:
         one.close()
-    row = {"failure": failure, "seconds": seconds, "mean_overlap": None, "largest_overlap": None}
+    row = {"failure": failure, "mean_overlap": None, "largest_overlap": None}
     row["strain"] = case.block * sum(map(len, blocks))
-    if tallies:
+    if tallies := [x.tally for x in runs if getattr(x, "tally", None) is not None]:
         total = sum(tallies[1:], start=tallies[0])
         row["mean_overlap"] = float(total.overlap / max(total.contacts, 1))
         row["largest_overlap"] = float(total.largest_overlap)
@@ -308,21 +255,18 @@ def _sampled(
     runs: "Sequence[Run | ContactDynamics]",
     enough: Callable[[dict], bool],
     limit: float,
-) -> tuple[list[list[Stress]], float]:
-    """Blocks of every seed until their averages are enough, or the time is up; and the processor
-    time.
-    """
+) -> list[list[Stress]]:
+    """Blocks of every seed until their averages are enough, or the processor time is up."""
     blocks: list[list[Stress]] = [[] for _ in runs]
     begin, target = time.process_time(), plan.fewest
     while True:
         for one, known in zip(runs, blocks, strict=True):
             known.append(one.advance())
-        seconds = time.process_time() - begin
-        if seconds > limit:
-            return blocks, seconds
+        if time.process_time() - begin > limit:
+            return blocks
         if len(blocks[0]) >= target:
             if enough(averages(blocks)):
-                return blocks, seconds
+                return blocks
             target = math.ceil(1.15 * target)
 
 
@@ -505,31 +449,26 @@ def draw(rows: list[dict]) -> Figure:
     edges = np.cumsum([0.0, *heights])
     figure, letters = empty_figure(TWO_COLUMNS, 1.35 + edges[-1]), set()
     axes = figure.add_subplot()
+    at = {(case_of(row), row["method"], row["setting"]): row for row in rows}
     for (method, setting, names, _), top, height in zip(lines, edges, heights, strict=False):
         for x, case in enumerate(cases):
-            row = next(
-                row
-                for row in rows
-                if case_of(row) == case and (row["method"], row["setting"]) == (method, setting)
-            )
+            row = at[case, method, setting]
             text, colour = cell_of(row, names)
             letters.add(text)
             if height == OF_THREE and row["largest_overlap"] is not None:
                 text += f"\n{row['largest_overlap']:.1g}".replace("0.", ".")
-            look = {"facecolor": colour, "edgecolor": "white"}
-            axes.add_patch(Rectangle((x - 0.5, top), 1, height, **look))
+            axes.add_patch(Rectangle((x - 0.5, top), 1, height, fc=colour, ec="white"))
             look = {"color": "white" if colour == WRONG_SILENT else "black", "linespacing": 0.9}
-            at = {"ha": "center", "va": "center", "fontsize": SMALL_SIZE}
-            axes.text(x, top + height / 2, text, **at, **look)
+            place = {"ha": "center", "va": "center", "fontsize": SMALL_SIZE}
+            axes.text(x, top + height / 2, text, **place, **look)
     axes.set(xlim=(-0.5, len(cases) - 0.5), ylim=(edges[-1], 0))
     axes.set_xticks(range(len(cases)), [name_of(case) for case in cases], fontsize=SMALL_SIZE)
     words = [line[-1] for line in lines]
     axes.set_yticks((edges[1:] + edges[:-1]) / 2, words, fontsize=SMALL_SIZE)
     axes.tick_params(length=0, labeltop=True, labelbottom=False)
     corner = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "bottom"}
-    axes.annotate(
-        "$\\alpha$\n$\\nu$\n$N$", (0, 1), (-3, 4), ha="right", fontsize=SMALL_SIZE, **corner
-    )
+    corner |= {"ha": "right", "fontsize": SMALL_SIZE}
+    axes.annotate("$\\alpha$\n$\\nu$\n$N$", (0, 1), (-3, 4), **corner)
     axes.spines[:].set_visible(False)
     known = "; ".join(f"{x}: {meaning}" for x, meaning in LETTERS.values() if x in letters)
     figure.legend(
@@ -554,9 +493,6 @@ def title(method: str, setting: float) -> str:
     method = "jaxgran" if method == DEFAULT else method
     if setting == 0:
         return method
-    mantissa, exponent = f"{setting:.0e}".split("e")
-    number = (
-        f"10^{{{int(exponent)}}}" if mantissa == "1" else rf"{mantissa}\times10^{{{int(exponent)}}}"
-    )
+    number = scientific(setting).replace("{}", "")
     name = "k" if method == SOFT else r"\mathrm{d}t"
     return f"{method}{', ' if method else ''}${name}={number}$"

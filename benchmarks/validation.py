@@ -10,8 +10,6 @@ the tolerance of jaxgran, and so the same force ratio.
     python -m benchmarks validation --quick   # two flows of 128 grains, about a minute
 """
 
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from itertools import product
 from types import ModuleType
@@ -22,10 +20,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran as jg
+from benchmarks.cores import on_all_cores
 from benchmarks.output import Output
 from benchmarks.peers import event_driven, jaxgran_itself, numba_rival
-from benchmarks.peers.problem import Flow, averages, blocks_of
-from jaxgran.environment import usable_cores
+from benchmarks.peers.problem import Flow, averages
 from jaxgran.plotting.style import TWO_COLUMNS, styled
 
 LABELS = {
@@ -34,6 +32,7 @@ LABELS = {
     "shear_stress": r"$\tau$",
     "force_ratio": r"$\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$",
 }
+COLOURS = "black", "0.5", "tab:blue", "tab:orange"
 TIMESTEP = 1e-4
 PROGRAMS: dict[str, tuple[ModuleType, str, float]] = {  # module, curve and setting
     "event-driven discs": (event_driven, "event-driven", 0.0),
@@ -61,14 +60,8 @@ QUICK = Plan(((0.9, 0.6), (0.2, 0.7)), 128, 2, 4, 1.0)
 def run(output: Output) -> None:
     """Compare all flows, print the differences, and write JSON and PNG."""
     plan = QUICK if output.quick else FULL
-    dense_first = sorted(plan.flows, key=lambda flow: -flow[1])
-    rows = []
-    with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
-        for some in pool.map(partial(rows_of_flow, plan), dense_first):
-            rows += some
-            for row in some:
-                print(", ".join(f"{name} {value}" for name, value in row.items()), flush=True)
-    rows.sort(key=lambda row: plan.flows.index((row["alpha"], row["nu"])))
+    some = on_all_cores(partial(rows_of_flow, plan), plan.flows, lambda flow: flow[1])
+    rows = [row for of_flow in some for row in of_flow]
     head = {**plan._asdict(), "timestep": TIMESTEP}
     head["programs"] = {name: summary(rows, name) for name in PROGRAMS}
     output.write_rows("validation", head, "rows", rows)
@@ -96,12 +89,11 @@ def rows_of_flow(plan: Plan, flow: tuple[float, float]) -> list[dict]:
     ]
 
     def means(program: ModuleType, curve: str, setting: float) -> dict[str, tuple[float, float]]:
-        return averages(
-            [
-                blocks_of(program, discs, Flow(*flow), curve, setting, plan.strain, plan.blocks)
-                for discs in starts
-            ]
-        )
+        samples = []
+        for discs in starts:
+            one = program.begin(discs, Flow(*flow), curve, setting, plan.strain)
+            samples.append([one.advance() for _ in range(plan.blocks + 1)][1:])
+        return averages(samples)
 
     ours = means(*ITSELF)
     rows = []
@@ -116,10 +108,9 @@ def rows_of_flow(plan: Plan, flow: tuple[float, float]) -> list[dict]:
             value, reference = ours[observable], theirs[observable]
             quotient = value[0] / reference[0]
             noise = quotient * np.hypot(value[1] / value[0], reference[1] / reference[0])
-            rows.append(
-                {**head, "observable": observable, "value": value, "reference": reference}
-                | {"difference": (quotient - 1, float(noise))}
-            )
+            row = {**head, "observable": observable, "value": value, "reference": reference}
+            rows.append(row | {"difference": (quotient - 1, float(noise))})
+            print(rows[-1], flush=True)
     return rows
 
 
@@ -128,9 +119,7 @@ def summary(rows: list[dict], program: str) -> dict[str, float]:
     mean square of the differences in standard errors of both.
     """
     compared = [row for row in rows if row["program"] == program and row["observable"] is not None]
-    sigmas = np.array(
-        [difference / error for difference, error in (row["difference"] for row in compared)]
-    )
+    sigmas = np.array([np.divide(*row["difference"]) for row in compared])
     return {
         "flows": len({(row["alpha"], row["nu"]) for row in compared}),
         "averages": len(compared),
@@ -152,15 +141,9 @@ def draw(rows: list[dict]) -> Figure:
             of_name = [row for row in shown if row["observable"] == name]
             if of_name:
                 difference, noise = 100 * np.transpose([row["difference"] for row in of_name])
-                axes.errorbar(
-                    difference,
-                    [place[row["alpha"], row["nu"]] + 0.2 * (1.5 - k) for row in of_name],
-                    xerr=noise,
-                    color=("black", "0.5", "tab:blue", "tab:orange")[k],
-                    marker="os^D"[k],
-                    ls="none",
-                    label=label,
-                )
+                y = [place[row["alpha"], row["nu"]] + 0.2 * (1.5 - k) for row in of_name]
+                look = {"color": COLOURS[k], "marker": "os^D"[k], "ls": "none", "label": label}
+                axes.errorbar(difference, y, xerr=noise, **look)
         for row in shown:
             if row["observable"] is None:
                 axes.text(0, place[row["alpha"], row["nu"]], "collapses", ha="center", va="center")
@@ -168,7 +151,6 @@ def draw(rows: list[dict]) -> Figure:
         axes.set(xlabel=f"jaxgran / {program} − 1 (%)", ylim=(-len(flows) + 0.4, 0.6))
         axes.tick_params(axis="y", length=0)
         axes.legend(ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    panels[0].set_yticks(
-        list(place.values()), [rf"$\alpha={alpha:g}$, $\nu={nu:g}$" for alpha, nu in flows]
-    )
+    names = [rf"$\alpha={alpha:g}$, $\nu={nu:g}$" for alpha, nu in flows]
+    panels[0].set_yticks(list(place.values()), names)
     return figure

@@ -102,24 +102,14 @@ def set_up(discs: Discs, flow: Flow, stiffness: float, skin: float, timestep: fl
     return program
 
 
-def begin(
-    discs: Discs,
-    flow: Flow,
-    curve: str,
-    stiffness: float,
-    duration: float,
-    skin: float | None = None,
-    checked: bool = False,
-) -> Run:
-    """A run at one stiffness. ``checked`` leaves the rebuilding of the neighbour list to LAMMPS."""
+def begin(discs: Discs, flow: Flow, curve: str, stiffness: float, duration: float) -> Run:
+    """A run at one stiffness."""
     sampling = STEPS_PER_CONTACT // SAMPLES_PER_CONTACT
     timestep = soft_timestep(discs, flow.restitution, stiffness, STEPS_PER_CONTACT)
     steps = max(1, round(duration / timestep / sampling)) * sampling
     timestep = duration / steps
-    if skin is None:
-        skin = float(
-            np.clip(STEPS_OF_A_LIST * timestep * closing_speed(discs, flow.shear_rate), *SKINS)
-        )
+    skin = STEPS_OF_A_LIST * timestep * closing_speed(discs, flow.shear_rate)
+    skin = float(np.clip(skin, *SKINS))
     program = set_up(discs, flow, stiffness, skin, timestep)
     program.commands_list(
         [
@@ -137,11 +127,8 @@ def begin(
         program.command(mean)
         left = steps
         while left > 0:
-            if checked:
-                program.command("neigh_modify delay 0 every 1 check yes")
-            else:
-                every = max(1, int(skin / (closing_speed(current(), flow.shear_rate) * timestep)))
-                program.command(f"neigh_modify delay 0 every {every} check no")
+            every = max(1, int(skin / (closing_speed(current(), flow.shear_rate) * timestep)))
+            program.command(f"neigh_modify delay 0 every {every} check no")
             to_flip = (0.5 - _tilt(program)) / (max(flow.shear_rate, 1e-9) * timestep)
             piece = min(left, max(1, round(to_flip / sampling)) * sampling)
             program.command(f"run {piece}")

@@ -8,7 +8,6 @@ The cell has the lattice vectors (side, 0) and (tilt · side, side).
 
 import math
 from collections.abc import Callable, Sequence
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -54,25 +53,6 @@ class Run(NamedTuple):
     close: Callable[[], None] = lambda: None
 
 
-def blocks_of(
-    peer: ModuleType,
-    discs: Discs,
-    flow: Flow,
-    curve: str,
-    setting: float,
-    duration: float,
-    count: int,
-) -> list[Stress]:
-    """Stresses of some successive advances of a run, past a first one that is left out; the run is
-    closed, also where the program fails.
-    """
-    run: Run = peer.begin(discs, flow, curve, setting, duration)
-    try:
-        return [run.advance() for _ in range(count + 1)][1:]
-    finally:
-        run.close()
-
-
 def averages(runs: Sequence[Sequence[Stress]]) -> dict[str, tuple[float, float]]:
     """Means over the blocks of one or more equally long runs, and their standard errors; without
     what a program does not know.
@@ -94,20 +74,15 @@ def relative(value: tuple[float, float], right: tuple[float, float]) -> tuple[fl
     return value[0] / right[0] - 1, float(np.hypot(value[1], right[1])) / right[0]
 
 
-def overlaps(discs: Discs) -> tuple[float, float]:
-    """Mean overlap of the touching pairs, in mean diameters (zero if none touch), and the
-    largest.
-    """
+def deepest(discs: Discs) -> float:
+    """The largest overlap of two discs, in mean diameters; zero if none touch."""
     d = discs.positions[:, None] - discs.positions[None]
     rows = np.round(d[..., 1] / discs.side)
     dx = d[..., 0] - rows * discs.tilt * discs.side
     dx -= discs.side * np.round(dx / discs.side)
     distance = np.hypot(dx, d[..., 1] - rows * discs.side)
-    depth = (discs.radii[:, None] + discs.radii[None] - distance)[
-        np.triu_indices(len(discs.radii), 1)
-    ]
-    touching = depth[depth > 0]
-    return (float(touching.mean()), float(touching.max())) if touching.size else (0.0, 0.0)
+    depth = discs.radii[:, None] + discs.radii[None] - distance
+    return max(0.0, float(np.max(depth[np.triu_indices(len(discs.radii), 1)])))
 
 
 def damping_ratio(restitution: float) -> float:
@@ -127,10 +102,8 @@ def soft_timestep(
     mass.
     """
     reduced = discs.masses.min() / 2
-    contact_time = (
-        math.pi * math.sqrt(reduced / stiffness) / math.sqrt(1 - damping_ratio(restitution) ** 2)
-    )
-    return contact_time / steps_per_contact
+    damped = math.sqrt(1 - damping_ratio(restitution) ** 2)
+    return math.pi * math.sqrt(reduced / stiffness) / damped / steps_per_contact
 
 
 def closing_speed(discs: Discs, shear_rate: float) -> float:
