@@ -3,8 +3,8 @@
 From the reference map: the dissipation rate Γ over Enskog's Γ_E at the measured temperature tensor,
 scaled to the local temperature; and the lengths L = Γ_E/Γ and L′ = (Γ_E/p_E)/(Γ/p) with contact
 pressures. Laws of L′ and of L′/L = p/p_E, which ``corrected_shear`` takes, are fitted to all flows,
-with each restitution and packing fraction left out in turn, and laws of L up to ν = 0.75. They are
-judged on 30 other flows (N = 1600, dt = 3e-4), as is the corrected theory.
+and without the densest, and laws of L up to ν = 0.75. They are judged on 30 other flows (N = 1600,
+dt = 3e-4), as is the corrected theory.
 
     python -m benchmarks dissipation           # four minutes on two cores
     python -m benchmarks dissipation --quick   # judged on smaller flows, one minute
@@ -66,34 +66,27 @@ corrected = jax.jit(
 def run(output: Output) -> None:
     """Compare, fit, judge, and write JSON and PNG."""
     another = JUDGED | ({"grains": 64} if output.quick else {})
-    maps = {
-        "map": reference_points(),
-        "paper": flattened(jg.open_map(RESULTS / "paper.nc")),
-        "judged_on": flattened(jg.ratio_map(**another, workers=usable_cores())),
-    }
-    flows = {name: flows_of(data) for name, data in maps.items()}
-    points, paper, judged = flows.values()
-    content = {name: head(data, len(flows[name])) for name, data in maps.items()} | {
+    other = flattened(jg.ratio_map(**another, workers=usable_cores()))
+    paper = flattened(jg.open_map(RESULTS / "paper.nc"))
+    points, paper, judged = map(flows_of, (reference_points(), paper, other))
+    shown = ["alpha", "nu", *PREDICTED, "length_from_pressure", "pair_factor"]
+    content = {
+        "judged_on": {
+            "points": len(judged),
+            "timestep": float(other.attrs["timestep"]),
+            "most_grains": int(other.attrs["grains"]),
+        },
         "counts": counts(points),
         "counts_of_paper": counts(paper),
         "largest_excess_of_root_chaos": root_chaos(points),
         "laws": laws_of_length(points, judged),
         "corrected_theory": corrected_theory(points, judged),
-        "judged_points": judged[
-            ["alpha", "nu", *PREDICTED, "length_from_pressure", "pair_factor"]
-        ].to_dict("records"),
+        "judged_points": judged[shown].to_dict("records"),
     }
     content = rounded(content, 4)
     print(*(f"{name}: {x}" for name, x in content.items() if name != "judged_points"), sep="\n")
     output.write_rows("dissipation", content, "points", rounded(points.to_dict("records"), 4))
     output.write_picture(draw(points, judged, fitted_laws(points)[0]), "dissipation")
-
-
-def head(data: xr.Dataset, points: int) -> dict[str, float]:
-    """Number of flows, time step, and the smallest and the largest number of grains of a map."""
-    sizes = np.ravel(data.attrs.get("grains_by_point", data.attrs["grains"]))
-    grains = {"fewest_grains": int(sizes.min()), "most_grains": int(sizes.max())}
-    return {"points": points, "timestep": float(data.attrs["timestep"]), **grains}
 
 
 def flows_of(data: xr.Dataset) -> pd.DataFrame:
@@ -126,11 +119,8 @@ def counts(flows: pd.DataFrame) -> dict[str, int]:
     """Flows whose collisions are binary within 1 %, and those of them without molecular chaos."""
     binary = abs(flows.binary - 1) < 0.01
     without = int((binary & (flows.chaos < 0.9)).sum())
-    return {
-        "points": len(flows),
-        "binary": int(binary.sum()),
-        "binary_without_chaos": without,
-    }
+    counted = {"points": len(flows), "binary": int(binary.sum())}
+    return counted | {"binary_without_chaos": without}
 
 
 def root_chaos(flows: pd.DataFrame) -> float:
@@ -182,15 +172,13 @@ def laws_of_length(flows: pd.DataFrame, judged: pd.DataFrame) -> dict[str, dict]
 # The corrected theory
 
 
-def fitted_laws(
-    flows: pd.DataFrame,
-) -> tuple[CorrelationLaws, dict[str, np.ndarray], dict[str, float]]:
-    """The laws of L′ and of the pairs at contact with the least squares of their logarithms, the
-    standard errors of their coefficients, and the rms of each.
+def fitted_laws(flows: pd.DataFrame) -> tuple[CorrelationLaws, dict[str, np.ndarray]]:
+    """The laws of L′ and of the pairs at contact with the least squares of their logarithms, and
+    the standard errors of their coefficients.
 
     A flow counts as much as the area of the plane of ln(1 − α) and ν that it stands for.
     """
-    laws, stderrs, rms_of = MEASURED_LAWS, {}, {}
+    laws, stderrs = MEASURED_LAWS, {}
     roots = np.sqrt(areas(flows.alpha.to_numpy(), flows.nu.to_numpy()))
     for name, (*_, start) in LAWS.items():
 
@@ -200,9 +188,8 @@ def fitted_laws(
         fit = least_squares(weighted, start, x_scale="jac", bounds=(0, np.inf))
         scatter = fit.fun @ fit.fun / (fit.fun.size - fit.x.size)
         stderrs[name] = np.sqrt(np.diag(scatter * np.linalg.inv(fit.jac.T @ fit.jac)))
-        rms_of[name] = rms(fit.fun / roots)
         laws = laws._replace(**{name: fit.x})
-    return laws, stderrs, rms_of
+    return laws, stderrs
 
 
 def areas(alphas: np.ndarray, nus: np.ndarray) -> np.ndarray:
@@ -233,43 +220,32 @@ def misfits(laws: CorrelationLaws, flows: pd.DataFrame) -> dict[str, np.ndarray]
 
 
 def corrected_theory(flows: pd.DataFrame, judged: pd.DataFrame) -> dict:
-    """The laws and their standard errors; rms errors of laws and theory for flows whose restitution
-    or packing fraction was not fitted; and errors with and without the laws in other flows.
+    """The laws and their standard errors; rms errors of laws and theory in other flows, and of laws
+    that were fitted without the densest flows in these; and errors with and without the laws.
     """
-    laws, stderrs, of_fit = fitted_laws(flows)
-    elsewhere = misfits(laws, judged)
-    result: dict = {
+    laws, stderrs = fitted_laws(flows)
+    errors = {"enskog": misfits(WITHOUT_LAWS, judged), "length_and_pairs": misfits(laws, judged)}
+    elsewhere = errors["length_and_pairs"]
+    densest = flows.nu == flows.nu.max()
+    left_out = misfits(fitted_laws(flows[~densest])[0], flows[densest])
+    return {
         "laws": {
             **{name: np.asarray(getattr(laws, name)).tolist() for name in LAWS},
             **{f"{name}_stderr": stderr.tolist() for name, stderr in stderrs.items()},
             "scatter": [rms(elsewhere[name]) for name in PREDICTED],
         },
-        "rms_of_fit": of_fit,
         "rms_judged": {name: rms(elsewhere[name]) for name in LAWS},
-    }
-    inner = {axis: np.unique(flows[axis])[1:-1] for axis in ("alpha", "nu")}
-    for kind, axis, values in (
-        ("alpha", "alpha", inner["alpha"]),
-        ("nu", "nu", inner["nu"]),
-        ("densest", "nu", [flows.nu.max()]),
-    ):
-        errors = pd.concat(
-            pd.DataFrame(misfits(fitted_laws(flows[flows[axis] != x])[0], flows[flows[axis] == x]))
-            for x in values
-        )
-        result[f"rms_{kind}_left_out"] = {name: rms(errors[name]) for name in errors}
-    for name, errors in (
-        ("enskog", misfits(WITHOUT_LAWS, judged)),
-        ("length_and_pairs", elsewhere),
-    ):
-        result[name] = {
+        "rms_densest_left_out": {name: rms(error) for name, error in left_out.items()},
+    } | {
+        theory: {
             average: {
-                "rms": rms(errors[average]),
-                "within_10_percent": int((abs(np.expm1(errors[average])) < 0.1).sum()),
+                "rms": rms(misfit[average]),
+                "within_10_percent": int((abs(np.expm1(misfit[average])) < 0.1).sum()),
             }
             for average in PREDICTED
         }
-    return result
+        for theory, misfit in errors.items()
+    }
 
 
 @styled
@@ -286,21 +262,16 @@ def draw(flows: pd.DataFrame, judged: pd.DataFrame, laws: CorrelationLaws) -> Fi
         left.errorbar(some.nu, some.length_from_pressure, some.length_from_pressure_error, **look)
         law = np.asarray(correlation_length(laws, np.full_like(dense, alpha), dense))
         left.plot(dense, law, color=style["color"], linestyle="-", linewidth=1)
-    for label, applied, face, shift in (
-        ("Enskog", WITHOUT_LAWS, "none", 0.004),
-        ("corrected", laws, "0", -0.004),
-    ):
+    looks = ("Enskog", WITHOUT_LAWS, "none", 0.004), ("corrected", laws, "0", -0.004)
+    for label, applied, face, shift in looks:
         ratio = np.exp(misfits(applied, judged)["pressure"])
         look = {"color": "0", "markerfacecolor": face, "markersize": 4.5, "label": label}
         right.plot(judged.nu + shift, ratio, "o", **look)
     right.axhspan(0.9, 1.1, color="0.9", zorder=0, label=r"within 10 %")
-    left.set(
-        yscale="log", xlabel=r"packing fraction $\nu$", ylabel=r"correlation length $L'/\sigma$"
-    )
-    right.set(
-        yscale="log", xlabel=r"packing fraction $\nu$", ylabel="predicted / measured pressure"
-    )
+    left.set_ylabel(r"correlation length $L'/\sigma$")
+    right.set_ylabel("predicted / measured pressure")
     for axes, place in ((left, "upper left"), (right, "lower left")):
+        axes.set(yscale="log", xlabel=r"packing fraction $\nu$")
         axes.axhline(1, color="0.6", linewidth=0.8, zorder=0)
         axes.legend(fontsize=SMALL_SIZE, frameon=False, loc=place)
         label_log_axis(axes.yaxis)
