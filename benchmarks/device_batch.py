@@ -48,29 +48,16 @@ def run(output: Output, engine: Literal["auto", "numba"] = "auto") -> None:
     if output.quick:
         batches, points = ((64, 256, 1e-3),), POINTS[:2]
     device = jax.local_devices()[0]
-    print(f"{jax.device_count()} × {device.device_kind}; replica-steps/s")
-    print(
-        "replicas  grains     dt     α     ν  device  one core of the rival  ratio  pressure"
-        "  compiled, s"
-    )
     head = {"device": device.device_kind, "devices": jax.device_count()}
     rows = []
     for (replicas, grains, dt), (alpha, nu) in product(batches, points):
         flow = jg.ShearFlow(grains=grains, restitution=alpha, packing_fraction=nu, timestep=dt)
         about = {"replicas": replicas, "grains": grains, "dt": dt, "alpha": alpha, "nu": nu}
         rows.append(about | compare(flow, replicas, numerics))
-        print(
-            "{replicas:8d}{grains:8d}{dt:7.0e}{alpha:6.2g}{nu:6.2g}{device:8.2g}{rival:23.2g}"
-            "{ratio:7.2g}{pressure:10.5f}{compilation:13.1f}".format(**rows[-1]),
-            flush=True,
-        )
+        print(rows[-1], flush=True)
+        name = f"device_batch_{device.platform}{'_numba' * (engine == 'numba')}"
         memory = (device.memory_stats() or {}).get("peak_bytes_in_use")
-        output.write_rows(
-            f"device_batch_{device.platform}{'_numba' * (engine == 'numba')}",
-            head | {"peak_bytes": memory},
-            "rows",
-            rows,
-        )
+        output.write_rows(name, head | {"peak_bytes": memory}, "rows", rows)
 
 
 def compare(flow: jg.ShearFlow, replicas: int, numerics: Numerics) -> dict:
@@ -122,10 +109,8 @@ def compare(flow: jg.ShearFlow, replicas: int, numerics: Numerics) -> dict:
 
 def pressure(tally: jg.Tally, flow: jg.ShearFlow, state: jg.State) -> np.ndarray:
     """Pressure of one sample, or of each of a batch."""
-    area = float(state.side) ** 2
-    return np.asarray(
-        averages(jax.device_get(tally), area, flow.grains, flow.shear_rate)["pressure"]
-    )
+    area, sums = float(state.side) ** 2, jax.device_get(tally)
+    return np.asarray(averages(sums, area, flow.grains, flow.shear_rate)["pressure"])
 
 
 def rivals(flow: jg.ShearFlow, states: list[jg.State], steps: int) -> None:

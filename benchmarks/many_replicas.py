@@ -10,6 +10,7 @@ those of the processor, so that other work on the machine counts little.
 
 import time
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +21,6 @@ from benchmarks.timing import timed
 
 POINTS = ((0.9, 0.5), (0.5, 0.7), (0.3, 0.75))
 GRAINS, TIMESTEP, REPLICAS, STEPS = 64, 1e-3, 16, 200
-
-
 WAYS = {
     "batch": jg.advance,
     "vmap": jax.vmap(jg.advance, (0, 0, None)),
@@ -33,18 +32,9 @@ def run(output: Output) -> None:
     """Measure every way at every point, print, and write JSON."""
     replicas, points = (2, POINTS[:1]) if output.quick else (REPLICAS, POINTS)
     starts = [prepared(alpha, nu, replicas) for alpha, nu in points]
-    rows = [measured(name, jax.jit(way), starts, points, replicas) for name, way in WAYS.items()]
-    output.write_json(
-        "many_replicas",
-        {
-            "grains": GRAINS,
-            "timestep": TIMESTEP,
-            "replicas": replicas,
-            "steps": STEPS,
-            "points": points,
-            "ways": rows,
-        },
-    )
+    rows = [measured(name, jax.jit(way), starts, replicas) for name, way in WAYS.items()]
+    head = {"grains": GRAINS, "timestep": TIMESTEP, "replicas": replicas, "steps": STEPS}
+    output.write_json("many_replicas", head | {"points": points, "ways": rows})
 
 
 def prepared(alpha: float, nu: float, replicas: int) -> tuple[jg.ShearFlow, jg.State]:
@@ -53,7 +43,7 @@ def prepared(alpha: float, nu: float, replicas: int) -> tuple[jg.ShearFlow, jg.S
     return flows, jg.prepare(flows, jax.random.split(jax.random.key(0), replicas), equilibrate=2.0)
 
 
-def measured(name: str, way, starts: list, points: tuple, replicas: int) -> dict:
+def measured(name: str, way: Any, starts: list, replicas: int) -> dict:
     """Costs of a way: compiled once, and run from the states of each point."""
     steps = jnp.int32(STEPS)
     begun = time.process_time()
@@ -62,21 +52,9 @@ def measured(name: str, way, starts: list, points: tuple, replicas: int) -> dict
     memory = program.memory_analysis().temp_size_in_bytes / 2**20
     for flows, states in starts:
         jax.block_until_ready(program(flows, states, steps))
-        run_seconds, _ = timed(
-            lambda f=flows, s=states: jax.block_until_ready(program(f, s, steps))
-        )
+        call = partial(program, flows, states, steps)
+        run_seconds, _ = timed(lambda call=call: jax.block_until_ready(call()))
         microseconds.append(run_seconds / (replicas * STEPS) * 1e6)
-    texts = " ".join(
-        f"({alpha}, {nu}): {us:.2f} µs"
-        for (alpha, nu), us in zip(points, microseconds, strict=True)
-    )
-    print(
-        f"{name:32} compile {seconds:5.1f} s  {memory / replicas:6.2f} MiB a replica  {texts}",
-        flush=True,
-    )
-    return {
-        "way": name,
-        "compile_seconds": seconds,
-        "mib_per_replica": memory / replicas,
-        "us": microseconds,
-    }
+    row = {"way": name, "compile_seconds": seconds, "mib_per_replica": memory / replicas}
+    print(row | {"us": microseconds}, flush=True)
+    return row | {"us": microseconds}

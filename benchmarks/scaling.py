@@ -39,10 +39,8 @@ COLLIDING_GRAINS, QUICK_COLLIDING_GRAINS = (256, 2_048, 16_384, 108_000), (256, 
 COLLISION_TIMESTEPS = (1e-3, 1e-4, 1e-5, 1e-6)
 FEW_COLLISIONS = 40_000  # of a timing, or two a grain in larger flows
 REPEATS = 5
-LINEAR = (
-    1_000,
-    100_000,
-)  # grains: smaller flows have steps without a contact, larger ones outgrow the caches
+# grains: smaller flows have steps without a contact, larger ones outgrow the caches
+LINEAR = (1_000, 100_000)
 
 
 def run(output: Output, grains: int | None = None) -> None:
@@ -60,7 +58,7 @@ def run(output: Output, grains: int | None = None) -> None:
         "collision": [row for n in colliding for row in collisions(n)],
     }
     fits = exponents(rows)
-    report(rows, fits)
+    print(fits)
     output.write_json("scaling", {"exponents": fits, **rows})
     output.write_picture(draw(rows, fits), "scaling")
 
@@ -78,27 +76,16 @@ def large_flow(grains: int) -> dict[str, float]:
     """
     alpha, nu = LARGE_FLOW
     flow = jg.ShearFlow(grains, alpha, nu, 1e-3)
-    before, wall = time.process_time(), time.perf_counter()
+    begin = time.perf_counter()
     state = jax.block_until_ready(jg.prepare(flow, jax.random.key(0), equilibrate=STRAIN_BEFORE))
-    prepared = {
-        "prepare cpu seconds": time.process_time() - before,
-        "prepare seconds": time.perf_counter() - wall,
-    }
-    start = time.process_time()
+    prepared = time.perf_counter() - begin
     compiled = jax.jit(jg.advance).lower(flow, state, jnp.int32(1)).compile()
-    compilation = time.process_time() - start
-    state, seconds, tally = timed(compiled, flow, state, STRAIN)
+    state, seconds, _ = timed(compiled, flow, state, STRAIN)
     return {
         "grains": grains,
-        **{name: round(value, 3) for name, value in prepared.items()},
-        "compile cpu seconds": round(compilation, 2),
+        "prepare seconds": round(prepared, 3),
         "seconds": seconds["wall"],
         "cpu seconds": seconds["cpu"],
-        "microseconds per grain and step": float(
-            f"{1e6 * seconds['cpu'] / (grains * float(tally.steps)):.4g}"
-        ),
-        "contacts per solve": round(float(tally.contacts / tally.solves), 2),
-        "status": jg.Status(int(tally.status)).name,
         "peak resident MiB": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
     }
 
@@ -128,18 +115,10 @@ def timesteps(at: tuple[float, float], dts: tuple[float, ...]) -> list[dict[str,
     for dt in dts:
         shorter = flow_of_arrays(replace(flow, timestep=dt))
         state, _, _ = timed(compiled, shorter, state, STRAIN_OF_TIMESTEP)
-        state, seconds, tally = timed(compiled, shorter, state, STRAIN_OF_TIMESTEP)
-        contacts = float(tally.contacts / tally.solves)
-        row = {
-            "alpha": at[0],
-            "nu": at[1],
-            "timestep": dt,
-            "cpu seconds per strain": seconds["cpu"] / STRAIN_OF_TIMESTEP,
-        }
-        rows.append(
-            row
-            | {"solves per step": float(tally.solves / tally.steps), "contacts per solve": contacts}
-        )
+        state, seconds, _ = timed(compiled, shorter, state, STRAIN_OF_TIMESTEP)
+        row = {"alpha": at[0], "nu": at[1], "timestep": dt}
+        rows.append(row | {"cpu seconds per strain": seconds["cpu"] / STRAIN_OF_TIMESTEP})
+        print(rows[-1], flush=True)
     return rows
 
 
@@ -158,16 +137,9 @@ def collisions(grains: int) -> list[dict[str, float]]:
         state, _, _ = timed(compiled, shorter, state, strain)
         _, none, _ = timed(compiled, shorter, state, 0.0)
         _, seconds, tally = timed(compiled, shorter, state, strain)
-        each = (seconds["cpu"] - none["cpu"]) / float(tally.collisions)
-        rows.append(
-            {
-                "grains": grains,
-                "timestep": dt,
-                "collisions": float(tally.collisions),
-                "microseconds per collision": float(f"{1e6 * each:.3g}"),
-                "seconds of a call without a step": none["cpu"],
-            }
-        )
+        each = 1e6 * (seconds["cpu"] - none["cpu"]) / float(tally.collisions)
+        row = {"grains": grains, "timestep": dt}
+        rows.append(row | {"microseconds per collision": float(f"{each:.3g}")})
         print(rows[-1], flush=True)
     return rows
 
@@ -187,36 +159,12 @@ def exponents(rows: dict[str, list[dict]]) -> dict[str, float]:
         return round(float(np.polyfit(*logs.T, 1)[0]), 3)
 
     large = [row for row in rows["grains"] if LINEAR[0] <= row["grains"] <= LINEAR[1]]
-    by_flow = {
-        f"timestep at α = {at[0]:g}, ν = {at[1]:g}": fitted(
-            [row for row in rows["timestep"] if (row["alpha"], row["nu"]) == at],
-            "timestep",
-            "cpu seconds per strain",
-        )
-        for at in (LARGE_FLOW, DENSE_FLOW)
-    }
-    return {
-        "grains": fitted(large, "grains", "cpu seconds"),
-        **by_flow,
-    }
-
-
-def report(rows: dict[str, list[dict]], fits: dict[str, float]) -> None:
-    """Print the exponents, and time and memory of the flows of many grains."""
-    for name, value in fits.items():
-        print(f"exponent of the cost against {name}: {value:.3f}")
-    first, *larger = (row for row in rows["grains"] if row["grains"] >= LINEAR[0])  # of one program
-    for row in larger:
-        resident = (
-            (row["peak resident MiB"] - first["peak resident MiB"])
-            * 2**20
-            / (row["grains"] - first["grains"])
-        )
-        print(
-            f"{row['grains']} grains for a strain of {STRAIN:g}: {row['seconds']:.3g} s, peak "
-            f"{row['peak resident MiB']} MiB; {resident:.0f} bytes more for each grain than "
-            f"{first['grains']} have"
-        )
+    fits = {"grains": fitted(large, "grains", "cpu seconds")}
+    for alpha, nu in (LARGE_FLOW, DENSE_FLOW):
+        name = f"timestep at α = {alpha:g}, ν = {nu:g}"
+        points = [row for row in rows["timestep"] if (row["alpha"], row["nu"]) == (alpha, nu)]
+        fits[name] = fitted(points, "timestep", "cpu seconds per strain")
+    return fits
 
 
 @styled
@@ -232,12 +180,10 @@ def draw(rows: dict[str, list[dict]], fits: dict[str, float]) -> Figure:
     grains.set_xlabel("number of grains $N$")
     grains.set_ylabel("CPU time of a unit of strain (s)")
     for (alpha, nu), look in ((DENSE_FLOW, "ks--"), (LARGE_FLOW, "ko-")):
-        rows_of_flow = [row for row in rows["timestep"] if (row["alpha"], row["nu"]) == (alpha, nu)]
+        points = [row for row in rows["timestep"] if (row["alpha"], row["nu"]) == (alpha, nu)]
         exponent = round(fits[f"timestep at α = {alpha:g}, ν = {nu:g}"], 1) + 0.0  # no -0.0
         label = rf"$\alpha={alpha:g}$, $\nu={nu:g}$: $\mathrm{{d}}t^{{{exponent:.1f}}}$"
-        x, y = (
-            [row[name] for row in rows_of_flow] for name in ("timestep", "cpu seconds per strain")
-        )
+        x, y = ([row[name] for row in points] for name in ("timestep", "cpu seconds per strain"))
         timestep.plot(x, y, look, label=label)
     timestep.set_xlabel(r"time step $\mathrm{d}t$ ($1/\dot\gamma$)")
     for axes in (grains, timestep):

@@ -36,18 +36,12 @@ jax.config.update("jax_enable_x64", True)
 import jaxgran as jg
 flow = jg.ShearFlow(grains=16, restitution=0.5, packing_fraction=0.3, timestep=1e-3)
 state = jg.heated(flow, jax.random.key(0))
-compiled = jax.jit(jg.sample)
-calls = [
-    lambda: jg.sample(flow, state, 0.032),
-    lambda: jax.block_until_ready(compiled(flow, state, 0.032)),
-]
-seconds = [[], []]  # in turn: of the call, and of what it has compiled
+seconds = []
 for _ in range(210):
-    for call, found in zip(calls, seconds):
-        start = time.perf_counter()
-        call()
-        found.append(time.perf_counter() - start)
-print(*(1e3 * statistics.median(found[10:]) for found in seconds))
+    start = time.perf_counter()
+    jg.sample(flow, state, 0.032)
+    seconds.append(time.perf_counter() - start)
+print(1e3 * statistics.median(seconds[10:]))
 """
 
 
@@ -60,23 +54,12 @@ def run(output: Output) -> None:
             words = (SMALL_MAP if output.quick and text.startswith("map") else text).split()
             first = seconds_of(words, folder)
             warm = [seconds_of(words, folder) for _ in range(2 if output.quick else RUNS)]
-            rows.append(
-                {
-                    "command": command,
-                    "first": first,
-                    "warm": statistics.median(warm),
-                    "warm_runs": warm,
-                }
-            )
-            print(f"{command:18} first {first:6.1f} s, then {rows[-1]['warm']:6.2f} s", flush=True)
-        sample, compiled = map(
-            float, process([sys.executable, "-c", _SAMPLE], folder).stdout.split()
-        )
-    print(
-        f"jg.sample of one step in each of 32 blocks: {sample:.2g} ms, of which "
-        f"{sample - compiled:.2g} ms Python"
-    )
-    milliseconds = {"sample_milliseconds": sample, "sample_python_milliseconds": sample - compiled}
+            row = {"command": command, "first": first, "warm": statistics.median(warm)}
+            rows.append(row | {"warm_runs": warm})
+            print(rows[-1], flush=True)
+        printed = process([sys.executable, "-c", _SAMPLE], folder).stdout
+    milliseconds = {"sample_milliseconds": float(printed)}
+    print(milliseconds)
     output.write_rows("startup", {"runs": RUNS} | milliseconds, "commands", rows)
 
 
