@@ -23,10 +23,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-MOST_SKIN, NARROW_SKIN = (
-    1.0,
-    0.2,
-)  # σ, added to the reach of a near pair, and the same times the packing fraction
+# σ, added to the reach of a near pair, and the same times the packing fraction
+MOST_SKIN, NARROW_SKIN = 1.0, 0.2
 HEADROOM = 1.5  # a list stands until a disc is faster than this, over the fastest when it was made
 LEAST_SPEED = 1e-3  # σ/t, of the fastest disc, so that the life of a list is finite
 MOST_COLLISIONS = 20_000_000  # of a block, more of which are taken for a collapse
@@ -95,11 +93,7 @@ class _Near(NamedTuple):
 
 
 def sheared(
-    discs: Discs,
-    law: Law,
-    duration: float,
-    blocks: int = 1,
-    most_collisions: int = MOST_COLLISIONS,
+    discs: Discs, law: Law, duration: float, blocks: int = 1, most_collisions: int = MOST_COLLISIONS
 ) -> tuple[Discs, dict[str, np.ndarray]]:
     """The discs after a time, and the sums over each of the blocks into which it is divided, arrays
     (blocks,).
@@ -115,17 +109,13 @@ def sheared(
     if cells < 3:
         raise ValueError("the cell must be at least three reaches of a disc wide: take more discs.")
     sums = np.zeros((blocks, len(SUMS)))
+    law = Law(*map(float, law))
     for row in sums:
-        discs = discs._replace(
-            **{name: getattr(discs, name).copy() for name in ("positions", "velocities", "last")}
-        )
-        tilt = _advance(
-            discs, Law(*map(float, law)), duration / blocks, skin, cells, most_collisions, row
-        )
+        moving = ("positions", "velocities", "last")
+        discs = discs._replace(**{name: getattr(discs, name).copy() for name in moving})
+        tilt = _advance(discs, law, duration / blocks, skin, cells, most_collisions, row)
         if row[COLLISIONS] >= most_collisions:
-            raise RuntimeError(
-                "more collisions than can be carried out, as in an inelastic collapse."
-            )
+            raise RuntimeError("more collisions than can be done, as in an inelastic collapse.")
         discs = discs._replace(tilt=tilt)
     return discs, dict(zip(SUMS, sums.T, strict=True))
 
@@ -194,15 +184,11 @@ def _near_pairs(positions, radii, side, tilt, rate, skin, cells):
         for cell in range(9):
             j = first[(columns[i] + cell % 3 - 1) % cells, (rows[i] + cell // 3 - 1) % cells]
             while j >= 0:
-                right, up = (
-                    np.round(shares[i, 0] - shares[j, 0]),
-                    np.round(shares[i, 1] - shares[j, 1]),
-                )
+                right = np.round(shares[i, 0] - shares[j, 0])
+                up = np.round(shares[i, 1] - shares[j, 1])
                 dx, dy = side * (right + tilt * up), side * up
-                x, y = (
-                    positions[i, 0] - positions[j, 0] - dx,
-                    positions[i, 1] - positions[j, 1] - dy,
-                )
+                x = positions[i, 0] - positions[j, 0] - dx
+                y = positions[i, 1] - positions[j, 1] - dy
                 if i != j and x * x + y * y < (radii[i] + radii[j] + skin) ** 2:
                     near.append(j)
                     shifts.append((dx, dy, rate * dy))
@@ -236,28 +222,25 @@ def _collide(discs, law, near, life, limit, most, sums):
         nx, ny = sx / distance, sy / distance
         approach = ux * nx + uy * ny
         soft = now - last[i] < tc or now - last[j] < tc
-        one_plus_alpha = 1.0 if soft else law.restitution
+        restitution = 1.0 if soft else law.restitution
         reduced = masses[i] * masses[j] / (masses[i] + masses[j])
-        impulse = -(1 + one_plus_alpha) * reduced * approach
+        impulse = -(1 + restitution) * reduced * approach
         sums[CONTACT] += impulse * nx * sx
         sums[CONTACT + 1] += impulse * nx * sy
         sums[CONTACT + 2] += impulse * ny * sy
-        sums[DISSIPATION] += (
-            (1 - one_plus_alpha * one_plus_alpha) / 2 * reduced * approach * approach
-        )
+        sums[DISSIPATION] += (1 - restitution * restitution) / 2 * reduced * approach * approach
         sums[COLLISIONS] += 1
         too_fast = False
         for disc, push in ((i, impulse), (j, -impulse)):
-            _add_kinetic(
-                sums, masses[disc], origins[disc], velocities[disc], since[disc], now, rate
-            )
+            origin, velocity = origins[disc], velocities[disc]
+            _add_kinetic(sums, masses[disc], origin, velocity, since[disc], now, rate)
             for axis, change in ((0, push * nx / masses[disc]), (1, push * ny / masses[disc])):
-                origins[disc, axis] -= change * now
-                velocities[disc, axis] += change
+                origin[axis] -= change * now
+                velocity[axis] += change
             since[disc], last[disc] = now, now
             stamps[disc] += 1
-            peculiar = velocities[disc, 0] - rate * (origins[disc, 1] + velocities[disc, 1] * now)
-            too_fast = too_fast or peculiar**2 + velocities[disc, 1] ** 2 > limit * limit
+            peculiar = velocity[0] - rate * (origin[1] + velocity[1] * now)
+            too_fast = too_fast or peculiar**2 + velocity[1] ** 2 > limit * limit
         if too_fast:
             life = now
             break
@@ -289,10 +272,8 @@ def _predict(heap, discs, near, stamps, i, now, life):
 def _relative(origins, velocities, near, i, place, now):
     """Separation and relative velocity of a disc and the image of a near one."""
     j = near.discs[place]
-    ux, uy = (
-        velocities[i, 0] - velocities[j, 0] - near.shifts[place, 2],
-        velocities[i, 1] - velocities[j, 1],
-    )
+    ux = velocities[i, 0] - velocities[j, 0] - near.shifts[place, 2]
+    uy = velocities[i, 1] - velocities[j, 1]
     sx = origins[i, 0] - origins[j, 0] - near.shifts[place, 0] + ux * now
     sy = origins[i, 1] - origins[j, 1] - near.shifts[place, 1] + uy * now
     return sx, sy, ux, uy
