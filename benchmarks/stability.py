@@ -155,18 +155,17 @@ def rows_of(plan: Plan, case: Case) -> tuple[dict, list[dict]]:
     """
     states = [start(case, seed) for seed in range(plan.seeds)]
     right = None if case.packing_fraction == JAMMED else reference(plan, case, states)
-    ways = [
-        (method, setting, partial(ContactDynamics, case, timestep=setting, **chosen))
+    ways = {
+        (method, setting): partial(ContactDynamics, case, timestep=setting, **chosen)
         for method, (settings, chosen) in METHODS.items()
         for setting in settings
-    ] + [
-        (method, setting, partial(peer_run, peer, case, setting))
+    } | {
+        (method, setting): partial(peer_run, peer, case, setting)
         for method, (settings, peer) in PEERS.items()
-        if not peer.missing()
-        for setting in settings
-    ]
+        for setting in (() if peer.missing() else settings)
+    }
     rows = []
-    for method, setting, begin in ways:
+    for (method, setting), begin in ways.items():
         found = measured(plan, case, [partial(begin, state) for state in states], right)
         rows.append({**asdict(case), "method": method, "setting": setting, **found})
         print(rows[-1], flush=True)
@@ -178,10 +177,8 @@ def reference(plan: Plan, case: Case, states: Sequence[jg.State]) -> dict[str, t
     found = {}
     for timestep, names in ((REFERENCE_TIMESTEP, STRESSES), (FORCE_TIMESTEP, ("force_ratio",))):
         flow = Flow(case.restitution, case.packing_fraction)
-        runs = [
-            numba_rival.begin(discs_of(state), flow, "reference", timestep, case.block)
-            for state in states
-        ]
+        begun = flow, "reference", timestep, case.block
+        runs = [numba_rival.begin(discs_of(state), *begun) for state in states]
         _warm_up(runs, case, math.inf)
 
         def precise(values: dict, names: tuple[str, ...] = names) -> bool:
@@ -193,16 +190,9 @@ def reference(plan: Plan, case: Case, states: Sequence[jg.State]) -> dict[str, t
     return found
 
 
-def measured(
-    plan: Plan,
-    case: Case,
-    begins: "Sequence[Callable[[], Run | ContactDynamics]]",
-    right: dict | None,
-) -> dict[str, Any]:
+def measured(plan: Plan, case: Case, begins: Sequence[Callable[[], Any]], right: Any) -> dict:
     """What a method makes of a flow: the keys of a row from ``failure`` on."""
-    runs: list[Run | ContactDynamics] = []
-    blocks: list[list[Stress]] = []
-    failure = None
+    runs, blocks, failure = [], [], None
 
     def decided(values: dict) -> bool:
         if right is None:
@@ -236,7 +226,7 @@ def measured(
     return row
 
 
-def _warm_up(runs: "Sequence[Run | ContactDynamics]", case: Case, limit: float) -> None:
+def _warm_up(runs: Sequence[Any], case: Case, limit: float) -> None:
     """Leave out the transient of every seed, and what is compiled in it.
 
     Raises:
@@ -250,17 +240,12 @@ def _warm_up(runs: "Sequence[Run | ContactDynamics]", case: Case, limit: float) 
                 raise Failure("too_slow")
 
 
-def _sampled(
-    plan: Plan,
-    runs: "Sequence[Run | ContactDynamics]",
-    enough: Callable[[dict], bool],
-    limit: float,
-) -> list[list[Stress]]:
+def _sampled(plan: Plan, runs: Sequence[Any], enough: Callable, limit: float) -> list[list[Stress]]:
     """Blocks of every seed until their averages are enough, or the processor time is up."""
     blocks: list[list[Stress]] = [[] for _ in runs]
     begin, target = time.process_time(), plan.fewest
     while True:
-        for one, known in zip(runs, blocks, strict=True):
+        for known, one in zip(blocks, runs, strict=True):
             known.append(one.advance())
         if time.process_time() - begin > limit:
             return blocks
@@ -307,22 +292,15 @@ def start(case: Case, seed: int) -> jg.State:
 class ContactDynamics:
     """A run of jaxgran in some way, like ``problem.Run``, with the sums of all that it sampled."""
 
-    def __init__(
-        self,
-        case: Case,
-        state: jg.State,
-        timestep: float,
-        dtype: str = "float64",
-        solver: jg.ProjectedMethod | None = None,
-        engine: Any = None,
-    ) -> None:
+    def __init__(self, case: Case, state: jg.State, timestep: float, **numerics: Any) -> None:
+        dtype, solver = numerics.get("dtype", "float64"), numerics.get("solver")
         self.case, self.flow = case, flow_of(case, timestep, dtype)
         self.state = jax.tree.map(lambda x: x.astype(dtype), state)
         self.solver = jax.tree.map(
             lambda x: jnp.asarray(x, "int32" if isinstance(x, int) else dtype),
             solver or jg.BarzilaiBorwein(),
         )
-        self.engine = engine
+        self.engine = numerics.get("engine")
         self.steps = round(case.block / timestep)
         self.tally: jg.Tally | None = None
 
@@ -471,13 +449,11 @@ def draw(rows: list[dict]) -> Figure:
     axes.annotate("$\\alpha$\n$\\nu$\n$N$", (0, 1), (-3, 4), **corner)
     axes.spines[:].set_visible(False)
     known = "; ".join(f"{x}: {meaning}" for x, meaning in LETTERS.values() if x in letters)
+    meaning = "error in %, standard error above 1 %, largest overlap in σ (jaxgran)"
     figure.legend(
         handles=[Patch(fc=colour, ec="0.6", lw=0.5, label=x) for colour, x in MEANINGS.items()],
-        loc="outside lower center",
-        ncols=3,
-        fontsize=SMALL_SIZE,
-        title=f"error in %, standard error above 1 %, largest overlap in σ (jaxgran); {known}",
-        title_fontsize=SMALL_SIZE,
+        loc="outside lower center", ncols=3, title=f"{meaning}; {known}",
+        fontsize=SMALL_SIZE, title_fontsize=SMALL_SIZE,
     )
     return figure
 

@@ -16,13 +16,8 @@ TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-6)
 BY_TOLERANCE, BY_JAX, BATCH = "jaxgran by tolerance", "JAX engine", "JAX engine, 16 flows"
 JACOBI = "projected Jacobi"
 FLOWS = 16  # of the batch
-CURVES = {
-    "jaxgran": TIMESTEPS,
-    BY_TOLERANCE: TOLERANCES,
-    BY_JAX: TIMESTEPS,
-    BATCH: (1e-3,),
-    JACOBI: TIMESTEPS,
-}
+CURVES = {"jaxgran": TIMESTEPS, BY_TOLERANCE: TOLERANCES, BY_JAX: TIMESTEPS}
+CURVES |= {BATCH: (1e-3,), JACOBI: TIMESTEPS}
 DEFAULT_TOLERANCE, MIDDLE_TIMESTEP = 1e-4, 1e-3
 
 
@@ -36,16 +31,10 @@ def begin(discs: Discs, flow: Flow, curve: str, setting: float, duration: float)
     The flows of the batch begin at different times of one flow, and together last as long as the
     one flow of the other curves.
     """
-    timestep, tolerance = (
-        (MIDDLE_TIMESTEP, setting) if curve == BY_TOLERANCE else (setting, DEFAULT_TOLERANCE)
-    )
-    law = jg.ShearFlow(
-        grains=len(discs.radii),
-        restitution=flow.restitution,
-        packing_fraction=flow.packing_fraction,
-        timestep=timestep,
-        shear_rate=flow.shear_rate,
-    )
+    by_tolerance = MIDDLE_TIMESTEP, setting
+    timestep, tolerance = by_tolerance if curve == BY_TOLERANCE else (setting, DEFAULT_TOLERANCE)
+    where = flow.restitution, flow.packing_fraction
+    law = jg.ShearFlow(len(discs.radii), *where, timestep, shear_rate=flow.shear_rate)
     solver = jg.Jacobi(tolerance) if curve == JACOBI else jg.BarzilaiBorwein(tolerance)
     engine = jg.Jax() if curve in (BY_JAX, BATCH) else None
     strain = duration * flow.shear_rate
@@ -74,9 +63,8 @@ def begin(discs: Discs, flow: Flow, curve: str, setting: float, duration: float)
 def state_of(discs: Discs) -> jg.State:
     """A state of jaxgran; without weak types, or a second call would compile again."""
     grains = Grains(jnp.asarray(discs.radii), jnp.asarray(discs.masses))
-    arrays = (
-        np.asarray(x, float) for x in (discs.positions, discs.velocities, discs.side, discs.tilt)
-    )
+    plain = discs.positions, discs.velocities, discs.side, discs.tilt
+    arrays = (np.asarray(x, float) for x in plain)
     return jg.State(grains, *map(jnp.asarray, arrays))
 
 
