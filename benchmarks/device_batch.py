@@ -57,7 +57,7 @@ def run(output: Output, engine: Literal["auto", "numba"] = "auto") -> None:
         print(rows[-1], flush=True)
         name = f"device_batch_{device.platform}{'_numba' * (engine == 'numba')}"
         memory = (device.memory_stats() or {}).get("peak_bytes_in_use")
-        output.write_rows(name, head | {"peak_bytes": memory}, "rows", rows)
+        output.write_json(name, head | {"peak_bytes": memory} | {"rows": rows})
 
 
 def compare(flow: jg.ShearFlow, replicas: int, numerics: Numerics) -> dict:

@@ -85,7 +85,7 @@ def run(output: Output) -> None:
     }
     content = rounded(content, 4)
     print(*(f"{name}: {x}" for name, x in content.items() if name != "judged_points"), sep="\n")
-    output.write_rows("dissipation", content, "points", rounded(points.to_dict("records"), 4))
+    output.write_json("dissipation", content | {"points": rounded(points.to_dict("records"), 4)})
     output.write_picture(draw(points, judged, fitted_laws(points)[0]), "dissipation")
 
 

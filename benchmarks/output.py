@@ -6,7 +6,7 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -94,28 +94,19 @@ class Output:
         return self.folder / f"{name}{'_quick' if self.quick else ''}{ending}"
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write a result below the hardware, to which the content may add."""
-        text = json.dumps({"hardware": self.hardware, **content}, indent=1)
-        self.path(name, ".json").write_text(text + "\n")
+        """Write a result below the hardware, to which the content may add: rows one to a line, in
+        which what is not a number is null.
+        """
+        parts = []
+        for key, value in {"hardware": self.hardware, **content}.items():
+            text = json.dumps(value, indent=1, ensure_ascii=False).replace("\n", "\n ")
+            if isinstance(value, list) and value and isinstance(value[0], dict):
+                rows = ({k: None if x != x else x for k, x in row.items()} for row in value)
+                lines = (json.dumps(row, ensure_ascii=False) for row in rows)
+                text = "[\n  " + ",\n  ".join(lines) + "\n ]"
+            parts.append(f' "{key}": {text}')
+        self.path(name, ".json").write_text("{\n" + ",\n".join(parts) + "\n}\n")
 
-    def write_rows(
-        self, name: str, head: Mapping[str, Any], key: str, rows: Sequence[Mapping[str, Any]]
-    ) -> None:
-        """Write a result with many rows, one to a line; what is not a number is null."""
-        start = json.dumps({"hardware": self.hardware, **head}, indent=1, ensure_ascii=False)
-        lines = ",\n".join(
-            "  "
-            + json.dumps(
-                {k: None if v != v else v for k, v in row.items()},
-                ensure_ascii=False,
-                allow_nan=False,
-            )
-            for row in rows
-        )
-        self.path(name, ".json").write_text(start[:-2] + f',\n "{key}": [\n{lines}\n ]\n}}\n')
-
-    def write_picture(
-        self, figure: Figure, name: str, ending: str = ".png", dpi: int = FILE_DPI
-    ) -> None:
+    def write_picture(self, figure: Figure, name: str, ending: str = ".png") -> None:
         """Write a figure as PNG."""
-        write(figure, self.path(name, ending), dpi, caption=False)
+        write(figure, self.path(name, ending), FILE_DPI, caption=False)

@@ -74,4 +74,4 @@ def compare_definitions(output: Output) -> None:
         rows.append(row | {"mean_mass": (float(ratio), float(error))})
         print(rows[-1])
     head = {"grains": grains, "strain": strain, "timestep": timestep}
-    output.write_rows("paper_mean_mass", head, "rows", rows)
+    output.write_json("paper_mean_mass", head | {"rows": rows})

@@ -85,7 +85,7 @@ def run(output: Output) -> None:
     head["large"] = {"grains": large["grains"], "rows": list(judged(table, large["rows"]))}
     head["whole_errors"] = whole_errors(table)
     print(*(f"{name}: {x}" for name, x in head.items() if name != "table"), sep="\n")
-    output.write_rows("reference", head, "rows", rows)
+    output.write_json("reference", head | {"rows": rows})
     output.write_picture(draw(table), "reference")
 
 

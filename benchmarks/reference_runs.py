@@ -42,7 +42,7 @@ def run(output: Output, part: Literal["random", "large"] = "random") -> None:
         options = {x: plan[x] for x in ("equilibrate", "strain")}
     measured = partial(row_of, options | {"timestep": plan["timestep"]})
     rows = on_all_cores(measured, flows, lambda flow: -flows.index(flow))
-    output.write_rows(name, {**plan, "first_seed": FIRST_SEED}, "rows", rows)
+    output.write_json(name, {**plan, "first_seed": FIRST_SEED} | {"rows": rows})
 
 
 def random_flows(points: int, grains: list[int]) -> list[Flow]:

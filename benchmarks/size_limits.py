@@ -69,7 +69,7 @@ def run(output: Output) -> None:
     for row in checks:
         print(rounded(row, 4))
     head = {"laws": rounded(laws, 5), "checks": rounded(checks, 4)}
-    output.write_rows("size_limits", head, "rows", rounded(limits, 5))
+    output.write_json("size_limits", head | {"rows": rounded(limits, 5)})
 
 
 def rows_of_maps(source: str, names: Sequence[str]) -> list[dict[str, Any]]:

@@ -63,7 +63,7 @@ def run(output: Output) -> None:
     flows = on_all_cores(partial(rows_of_flow, plan), plan.flows, lambda flow: flow[2])
     rows = [row for some in flows for row in some]
     head = {"sampled_memories": SAMPLED, "blocks": BLOCKS, "timestep": TIMESTEP}
-    output.write_rows("size_study", head, "flows", rows)
+    output.write_json("size_study", head | {"flows": rows})
     output.write_picture(draw_sizes(rows), "size_study")
     output.write_picture(draw_waves(rows), "size_study", "_waves.png")
 

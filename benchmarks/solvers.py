@@ -46,7 +46,7 @@ def run(output: Output) -> None:
             rows.append(head | {"method": name, "tolerance": tolerance} | costs)
             print(rows[-1], flush=True)
     head = {"grains": GRAINS, "timestep": TIMESTEP, "networks": CHOSEN, "cap": CAP}
-    output.write_rows("solvers", head, "rows", rows)
+    output.write_json("solvers", head | {"rows": rows})
 
 
 def networks_of(alpha: float, nu: float) -> list[jg.ContactNetwork]:

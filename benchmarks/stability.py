@@ -131,7 +131,7 @@ def run(output: Output) -> None:
     rows = [row for _, some in results for row in some]
     head = {"seeds": plan.seeds, "right": RIGHT, "precision": PRECISION, "seconds": SECONDS}
     head |= {"references": [reference for reference, _ in results]}
-    output.write_rows("stability", head, "rows", rows)
+    output.write_json("stability", head | {"rows": rows})
     output.write_picture(draw(rows), "stability")
 
 
@@ -452,8 +452,11 @@ def draw(rows: list[dict]) -> Figure:
     meaning = "error in %, standard error above 1 %, largest overlap in σ (jaxgran)"
     figure.legend(
         handles=[Patch(fc=colour, ec="0.6", lw=0.5, label=x) for colour, x in MEANINGS.items()],
-        loc="outside lower center", ncols=3, title=f"{meaning}; {known}",
-        fontsize=SMALL_SIZE, title_fontsize=SMALL_SIZE,
+        loc="outside lower center",
+        ncols=3,
+        title=f"{meaning}; {known}",
+        fontsize=SMALL_SIZE,
+        title_fontsize=SMALL_SIZE,
     )
     return figure
 

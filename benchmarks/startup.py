@@ -60,7 +60,7 @@ def run(output: Output) -> None:
         printed = process([sys.executable, "-c", _SAMPLE], folder).stdout
     milliseconds = {"sample_milliseconds": float(printed)}
     print(milliseconds)
-    output.write_rows("startup", {"runs": RUNS} | milliseconds, "commands", rows)
+    output.write_json("startup", {"runs": RUNS} | milliseconds | {"commands": rows})
 
 
 def process(command: list[str], folder: Path) -> subprocess.CompletedProcess:

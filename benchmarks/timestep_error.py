@@ -60,7 +60,7 @@ def run(output: Output) -> None:
     done, rows = dict(zip(tasks, sampled, strict=True)), []
     for nu, alpha in flows:
         rows += rows_of_flow(alpha, nu, [done[nu, alpha, seed] for seed in range(plan.seeds)])
-    output.write_rows("timestep_error", {"plan": plan._asdict()}, "rows", rows)
+    output.write_json("timestep_error", {"plan": plan._asdict()} | {"rows": rows})
 
 
 def verdicts(rows: Sequence[Mapping], grains: int) -> dict:

@@ -64,7 +64,7 @@ def run(output: Output) -> None:
     rows = [row for of_flow in some for row in of_flow]
     head = {**plan._asdict(), "timestep": TIMESTEP}
     head["programs"] = {name: summary(rows, name) for name in PROGRAMS}
-    output.write_rows("validation", head, "rows", rows)
+    output.write_json("validation", head | {"rows": rows})
     output.write_picture(draw(rows), "validation")
 
 
