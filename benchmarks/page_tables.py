@@ -70,10 +70,8 @@ def option_rows(command: str) -> list[str]:
 
 def examples(command: str) -> str:
     """The examples of a command."""
-    lines = [
-        f"# {meaning}\n{example}" for meaning, example in table_of(command, "EXAMPLES").items()
-    ]
-    return "\n".join(["```shell", *lines, "```"])
+    examples = table_of(command, "EXAMPLES").items()
+    return "\n".join(["```shell", *(f"# {about}\n{line}" for about, line in examples), "```"])
 
 
 def notebooks() -> str:

@@ -124,34 +124,30 @@ def point(file: str, name: str, restitution: float, packing_fraction: float) -> 
     """A variable of a map at a point, and its standard error; 0 for a prediction, which has
     none.
     """
-    group, _, variable = name.rpartition("/")
-    data = _map(file)[group] if group else _map(file)
-    chosen = {"restitution": restitution, "packing_fraction": packing_fraction}
-    error = float(data[f"{variable}_stderr"].sel(chosen)) if f"{variable}_stderr" in data else 0.0
-    return float(data[variable].sel(chosen)), error
+    data = _map(file)[name.rpartition("/")[0] or "/"]
+    variable = data[name.rpartition("/")[2]]
+    error = data.get(f"{variable.name}_stderr", 0.0 * variable)
+    return _at_point((variable, error), restitution, packing_fraction)
 
 
 def shear_stress_ratio_at(
     file: str, restitution: float, packing_fraction: float
 ) -> tuple[float, float]:
     """Contact shear stress over the binary one at a point of a map, and its standard error."""
+    return _at_point(shear_stress_ratio(_map(file)), restitution, packing_fraction)
+
+
+def _at_point(variables: Any, restitution: float, packing_fraction: float) -> tuple[float, float]:
     chosen = {"restitution": restitution, "packing_fraction": packing_fraction}
-    value, error = (float(values.sel(chosen)) for values in shear_stress_ratio(_map(file)))
+    value, error = (float(x.sel(chosen)) for x in variables)
     return value, error
 
 
 def grains_for(error: float, restitution: float, packing_fraction: float) -> int:
     """The number of grains that ``--error`` chooses for a flow with one seed."""
-    settings, _ = chosen_settings(
-        {
-            "restitution": restitution,
-            "packing_fraction": packing_fraction,
-            "error": error,
-            "seeds": 1,
-            "grains": "auto",
-            "timestep": "auto",
-        }
-    )
+    flow = {"restitution": restitution, "packing_fraction": packing_fraction}
+    automatic = {"error": error, "seeds": 1, "grains": "auto", "timestep": "auto"}
+    settings, _ = chosen_settings(flow | automatic)
     return settings.grains[-1]
 
 
@@ -182,13 +178,8 @@ def output_of_where(restitution: float, packing_fraction: float) -> str:
     """What ``jaxgran where`` prints, without empty lines in its table."""
     command = f"where --restitution {restitution} --packing-fraction {packing_fraction}"
     environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1"}
-    done = subprocess.run(
-        [sys.executable, "-m", "jaxgran", *command.split()],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=environment,
-    )
+    words = [sys.executable, "-m", "jaxgran", *command.split()]
+    done = subprocess.run(words, capture_output=True, text=True, check=True, env=environment)
     verdict, table = done.stdout.split("α = ")
     lines = [line.rstrip() for line in f"α = {table}".splitlines()]
     return "\n".join([textwrap.fill(" ".join(verdict.split()), 100), "", *filter(None, lines)])
@@ -221,10 +212,9 @@ ENVIRONMENT.globals |= {
         *(max, at, fastest_loop, point, quotients, validity),
         *(sig, percent, percent_pm, pm, duration),
         *(grains_for, shear_stress_ratio_at, output_of_where),
+        *(page_tables.variables, page_tables.options, page_tables.examples),
+        page_tables.notebooks,
     )
-}
-ENVIRONMENT.globals |= {
-    name: getattr(page_tables, name) for name in ("variables", "options", "examples", "notebooks")
 }
 
 

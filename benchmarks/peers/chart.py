@@ -94,17 +94,11 @@ def draw(result: dict) -> Figure:
         axes.yaxis.set_major_locator(FixedLocator([0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1]))
         axes.yaxis.set_minor_locator(NullLocator())
         axes.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{100 * x:g} %"))
-    figure.supxlabel(
-        "processor time per grain and unit of strain (µs); lower left is better",
-        fontsize=LABEL_SIZE,
-    )
-    figure.legend(
-        handles=[handles[curve] for curve in LOOKS if curve in handles],
-        labels=[LOOKS[curve].label for curve in LOOKS if curve in handles],
-        loc="outside upper center",
-        ncols=4,
-        fontsize=SMALL_SIZE,
-    )
+    words = "processor time per grain and unit of strain (µs); lower left is better"
+    figure.supxlabel(words, fontsize=LABEL_SIZE)
+    shown = {LOOKS[curve].label: handles[curve] for curve in LOOKS if curve in handles}
+    place = {"loc": "outside upper center", "ncols": 4, "fontsize": SMALL_SIZE}
+    figure.legend(list(shown.values()), list(shown), **place)
     return figure
 
 
@@ -123,9 +117,7 @@ def _draw_curve(axes: Axes, flow: dict, curve: str, look: Look, name: str):
     resolved = abs(signed) > 2 * noise
     down = np.minimum(noise, errors - LEAST)
     for which, face in ((resolved, look.colour), (~resolved, "white")):
-        bars = [down[which], noise[which]]
-        axes.errorbar(
-            costs[which], errors[which], bars, ls="none", mfc=face, elinewidth=0.6, **style
-        )
+        bars, at = [down[which], noise[which]], (costs[which], errors[which])
+        axes.errorbar(*at, bars, ls="none", mfc=face, elinewidth=0.6, **style)
     (handle,) = axes.plot([], [], ls=look.line or "none", lw=1.1, **style)
     return handle

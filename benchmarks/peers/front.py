@@ -1,7 +1,6 @@
 """From times and errors to a table: what stresses within 3 % take, at equal overlaps."""
 
 import math
-from typing import NamedTuple
 
 OBSERVABLES = ("pressure", "shear_stress")
 TARGET = 0.03
@@ -9,20 +8,14 @@ COST = "cpu_seconds_per_strain"
 TIME_STEPPED = "numba loop", "JAX engine", "projected Jacobi"
 
 
-class Choice(NamedTuple):
-    """A setting of a program, and whether its stresses are within the target."""
-
-    row: dict
-    reached: bool
-
-
 def rows_of(flow: dict, curve: str) -> list[dict]:
     """The rows of a program that ran, coarse before fine."""
     return [row for row in flow["rows"] if row["curve"] == curve and "errors" in row]
 
 
-def cheapest(rows: list[dict]) -> Choice | None:
-    """The coarsest setting whose stresses are within the target, or the finest if none is.
+def cheapest(rows: list[dict]) -> tuple[dict, bool] | None:
+    """The coarsest setting whose stresses are within the target, or the finest if none is; and
+    whether it is within.
 
     Errors change sign along a curve. So a setting that meets the target by chance, while a finer
     one misses it beyond twice its standard error, is passed over.
@@ -31,37 +24,28 @@ def cheapest(rows: list[dict]) -> Choice | None:
         return None
     misses = [k for k, row in enumerate(rows) if _misses(row)]
     reached = [row for row in rows[max(misses, default=-1) + 1 :] if _largest_error(row) <= TARGET]
-    return Choice(reached[0], True) if reached else Choice(rows[-1], False)
-
-
-def equal_work(flow: dict, curve: str) -> tuple[Choice, Choice] | None:
-    """The cheapest settings of jaxgran and of another program within the target, where jaxgran's
-    overlaps are no deeper than those of the other; its finest setting where all are deeper.
-    """
-    theirs = cheapest(rows_of(flow, curve))
-    if theirs is None:
-        return None
-    depth = theirs.row["largest_overlap"]
-    rows = rows_of(flow, "jaxgran")
-    ours = cheapest([row for row in rows if row["largest_overlap"] <= depth] or rows[-1:])
-    return None if ours is None else (ours, theirs)
+    return (reached[0], True) if reached else (rows[-1], False)
 
 
 def ratio(flow: dict, curve: str) -> str:
-    """Time of another program over that of jaxgran; "> " where it does not reach the target.
+    """Time of another program over that of jaxgran, of the cheapest settings within the target;
+    jaxgran's overlaps are no deeper than those of the other. "> " where that does not reach it.
 
     That of soft discs is given from the stiffness before the cheapest one within the target to this
     one, as the target is reached somewhere between.
     """
-    pair = equal_work(flow, curve)
-    if pair is None or not pair[0].reached:
+    rows, own = rows_of(flow, curve), rows_of(flow, "jaxgran")
+    if (best := cheapest(rows)) is None:
         return "–"
-    ours, theirs = pair
-    rows = rows_of(flow, curve)
-    place = rows.index(theirs.row)
+    theirs, reached = best
+    shallow = [row for row in own if row["largest_overlap"] <= theirs["largest_overlap"]]
+    ours = cheapest(shallow or own[-1:])
+    if ours is None or not ours[1]:
+        return "–"
+    place = rows.index(theirs)
     before = max(0, place - 1) if curve == "LAMMPS" else place
-    costs = [row[COST] / ours.row[COST] for row in rows[before : place + 1]]
-    if not theirs.reached:
+    costs = [row[COST] / ours[0][COST] for row in rows[before : place + 1]]
+    if not reached:
         return f"> {_two_digits(costs[-1])}"
     first, last = _two_digits(min(costs)), _two_digits(max(costs))
     return first if first == last else f"{first}–{last}"
@@ -93,12 +77,13 @@ def table(flows: list[dict]) -> str:
             if best is None:
                 lines.append(f"| {where} | {curve} | – | {failure_of(curve)} | – | – | – | – | – |")
                 continue
-            errors = [f"{100 * e:+.1f} ± {100 * s:.1f} %" for e, s in _errors(best.row)]
-            cost = _two_digits(1e6 * best.row[COST] / flow["discs"])
+            row, _ = best
+            errors = [f"{100 * e:+.1f} ± {100 * s:.1f} %" for e, s in _errors(row)]
+            cost = _two_digits(1e6 * row[COST] / flow["discs"])
             over = "1" if curve == "jaxgran" else ratio(flow, curve)
-            overlap = _two_digits(best.row["largest_overlap"])
+            overlap = _two_digits(row["largest_overlap"])
             equal = ratio_at_equal_timesteps(flow, curve) if curve in TIME_STEPPED else "–"
-            cells = where, curve, _setting(curve, best.row), cost, over, equal, *errors, overlap
+            cells = where, curve, _setting(curve, row), cost, over, equal, *errors, overlap
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
