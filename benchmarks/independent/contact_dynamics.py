@@ -168,6 +168,13 @@ def _root(parent, grain):
 
 
 @compiled
+def _fall(row, rows, kick_x, kick_y, i, j):
+    """Minus the normal velocity of a contact after the kicks, times the reduced mass."""
+    across = rows[row] * (kick_x[j] - kick_x[i])
+    return across + rows[row + np.uint64(1)] * (kick_y[j] - kick_y[i]) - rows[row + np.uint64(6)]
+
+
+@compiled
 def _gauss_seidel(first, second, rows, impulse, kick_x, kick_y, start, stop, target):
     """Impulses of one cluster by projected Gauss-Seidel: 0 <= p, w = W p + u >= 0, p w = 0.
 
@@ -185,11 +192,7 @@ def _gauss_seidel(first, second, rows, impulse, kick_x, kick_y, start, stop, tar
             i = first[c]
             j = second[c]
             old = impulse[c]
-            fall = (
-                rows[row] * (kick_x[j] - kick_x[i])
-                + rows[row + np.uint64(1)] * (kick_y[j] - kick_y[i])
-                - rows[row + np.uint64(6)]
-            )
+            fall = _fall(row, rows, kick_x, kick_y, i, j)
             change = max(relax * fall, -old)
             if change != 0.0:
                 impulse[c] = old + change
@@ -205,30 +208,13 @@ def _gauss_seidel(first, second, rows, impulse, kick_x, kick_y, start, stop, tar
                 row = np.uint64(ROW) * c
                 i = first[c]
                 j = second[c]
-                fall = (
-                    rows[row] * (kick_x[j] - kick_x[i])
-                    + rows[row + np.uint64(1)] * (kick_y[j] - kick_y[i])
-                    - rows[row + np.uint64(6)]
-                )
+                fall = _fall(row, rows, kick_x, kick_y, i, j)
                 residual = min(impulse[c], -fall) * rows[row + np.uint64(7)]
                 true += residual * residual
             if true <= target:
                 return
         elif not seen < math.inf:
             return
-
-
-@compiled
-def _pad(parabola, count):
-    """Fill the last block of the inner list with pairs that never meet; returns the number of
-    blocks.
-    """
-    blocks = (count + BLOCK - 1) // BLOCK
-    for p in range(count, blocks * BLOCK):
-        parabola[p // BLOCK, 0, p % BLOCK] = FAR
-        parabola[p // BLOCK, 1, p % BLOCK] = 0.0
-        parabola[p // BLOCK, 2, p % BLOCK] = 0.0
-    return blocks
 
 
 @compiled
@@ -412,7 +398,9 @@ def _run(x, y, vx, vy, radii, masses, side, tilt, law, steps, room, sums):
                     chain_heads[i] = 2 * pairs
                     chain_heads[j] = 2 * pairs + 1
                     pairs += 1
-            blocks = _pad(parabola, pairs)
+            blocks = (pairs + BLOCK - 1) // BLOCK
+            for p in range(pairs, blocks * BLOCK):  # pairs that never meet fill the last block
+                parabola[p // BLOCK, :, p % BLOCK] = FAR, 0.0, 0.0
             rate = 2.0 * fastest + abs(shear_rate) * (largest + inner_skin)
 
         sums[KINETIC] += sxx
