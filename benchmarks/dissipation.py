@@ -117,10 +117,9 @@ def flows_of(data: xr.Dataset) -> pd.DataFrame:
 
 def counts(flows: pd.DataFrame) -> dict[str, int]:
     """Flows whose collisions are binary within 1 %, and those of them without molecular chaos."""
-    binary = abs(flows.binary - 1) < 0.01
-    without = int((binary & (flows.chaos < 0.9)).sum())
-    counted = {"points": len(flows), "binary": int(binary.sum())}
-    return counted | {"binary_without_chaos": without}
+    binary = flows[abs(flows.binary - 1) < 0.01]
+    numbers = {"points": len(flows), "binary": len(binary)}
+    return numbers | {"binary_without_chaos": int((binary.chaos < 0.9).sum())}
 
 
 def root_chaos(flows: pd.DataFrame) -> float:

@@ -7,14 +7,12 @@ least-squares fit to the logarithms.
 
     python -m benchmarks scaling           # up to 1e6 grains; 7 minutes
     python -m benchmarks scaling --quick   # up to 1e4 grains; most of it compilation
-    python -m benchmarks scaling --grains 100000   # one flow, for a strain of 0.1, as JSON
 """
 
-import json
+import multiprocessing
 import resource
-import subprocess
-import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
 import jax
@@ -23,7 +21,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran as jg
-from benchmarks import ROOT
 from benchmarks.output import Output
 from jaxgran.plotting.style import TWO_COLUMNS, styled
 
@@ -43,13 +40,8 @@ REPEATS = 5
 LINEAR = (1_000, 100_000)
 
 
-def run(output: Output, grains: int | None = None) -> None:
-    """Measure all growths, print, and write JSON and PNG; or print one flow of so many grains as
-    JSON.
-    """
-    if grains is not None:
-        print(json.dumps(large_flow(grains)))
-        return
+def run(output: Output) -> None:
+    """Measure all growths, print, and write JSON and PNG."""
     sizes, dts = (QUICK_GRAINS, QUICK_TIMESTEPS) if output.quick else (GRAINS, TIMESTEPS)
     colliding = QUICK_COLLIDING_GRAINS if output.quick else COLLIDING_GRAINS
     rows = {
@@ -64,10 +56,10 @@ def run(output: Output, grains: int | None = None) -> None:
 
 
 def in_own_process(grains: int) -> dict[str, float]:
-    command = [sys.executable, "-m", "benchmarks", "scaling", "--grains", str(grains)]
-    text = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, cwd=ROOT).stdout
-    print(f"{grains} grains: {text.strip()}", flush=True)
-    return json.loads(text)
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        row = pool.submit(large_flow, grains).result()
+    print(row, flush=True)
+    return row
 
 
 def large_flow(grains: int) -> dict[str, float]:
