@@ -23,7 +23,6 @@ from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.results import write_dataset
 from jaxgran.plotting.factors import enskog_factors
 from jaxgran.plotting.ratio import ratio_contours, ratio_curves
-from jaxgran.plotting.style import FILE_DPI, write
 from jaxgran.plotting.theory import theory_errors
 
 QUICK = {"restitution": (0.1, 0.5, 0.9), "packing_fraction": (0.5, 0.7, 0.8)}
@@ -47,7 +46,7 @@ def run(output: Output, mean_mass: bool = False) -> None:
     data.attrs |= {"command": "python -m benchmarks paper", "commit": output.hardware["commit"]}
     write_dataset(data, output.path("paper", ".nc"))
     for name, draw in FIGURES.items():
-        write(draw(data), output.path("paper", f"_{name}.png"), FILE_DPI, False)
+        output.write_picture(draw(data), "paper", f"_{name}.png")
 
 
 def observe(seen: jg.Snapshot) -> dict[str, jax.Array]:

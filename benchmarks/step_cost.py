@@ -20,6 +20,7 @@ import numpy as np
 import jaxgran as jg
 from benchmarks.independent import contact_dynamics
 from benchmarks.output import Output
+from benchmarks.peers.jaxgran_itself import discs_of
 
 ONE_CORE = True
 
@@ -74,14 +75,9 @@ def compare(alpha: float, nu: float, dt: float, repeats: int) -> dict:
         if repeat:
             ours.append((middle - start) / steps * 1e6)
             theirs.append((end - middle) / steps * 1e6)
-    return {
-        "alpha": alpha,
-        "nu": nu,
-        "dt": dt,
-        "jaxgran_us": float(np.median(ours)),
-        "rival_us": float(np.median(theirs)),
-        "ratio": float(np.median(np.array(ours) / np.array(theirs))),
-    }
+    ratio = np.median(np.array(ours) / np.array(theirs))
+    row = {"alpha": alpha, "nu": nu, "dt": dt, "ratio": float(ratio)}
+    return row | {"jaxgran_us": float(np.median(ours)), "rival_us": float(np.median(theirs))}
 
 
 advance = jax.jit(partial(jg.advance, solver=jg.BarzilaiBorwein(TOLERANCE)))
@@ -90,14 +86,5 @@ advance = jax.jit(partial(jg.advance, solver=jg.BarzilaiBorwein(TOLERANCE)))
 def rival_arguments(flow: jg.ShearFlow, state: jg.State) -> dict[str, Any]:
     """What the rival needs to know of a flow and its state, which it changes."""
     law = {name: float(getattr(flow, name)) for name in ("shear_rate", "restitution", "timestep")}
-    return {
-        "positions": np.array(state.positions),
-        "velocities": np.array(state.velocities),
-        "radii": np.array(state.grains.radii),
-        "masses": np.array(state.grains.masses),
-        "side": float(state.side),
-        "tilt": float(state.tilt),
-        **law,
-        "activation": flow.activation,
-        "tolerance": TOLERANCE,
-    }
+    rule = {"activation": flow.activation, "tolerance": TOLERANCE}
+    return discs_of(state)._asdict() | law | rule

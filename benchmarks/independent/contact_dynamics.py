@@ -124,9 +124,6 @@ def _outer_pairs(x, y, radii, side, tilt, skin, heads, links, outer):
         heads[cell] = i
     for row in range(rows):
         for column in range(columns):
-            start = heads[row * columns + column]
-            if start < 0:
-                continue
             for k in range(5):
                 # the cell itself, its right neighbour, and the three above
                 to_row = row + (1 if k >= 2 else 0)
@@ -135,7 +132,7 @@ def _outer_pairs(x, y, radii, side, tilt, skin, heads, links, outer):
                 nx = float(to_column // columns)
                 across = (nx + ny * tilt) * side
                 other = heads[to_row % rows * columns + to_column % columns]
-                i = start
+                i = heads[row * columns + column]
                 while i >= 0:
                     xi = x[i] - across
                     yi = y[i] - ny * side
@@ -375,8 +372,7 @@ def _run(x, y, vx, vy, radii, masses, side, tilt, law, steps, room, sums):
                     done = step
                     break
             pairs = 0
-            for i in range(grains):
-                chain_heads[i] = -1
+            chain_heads[:] = -1
             for p in range(found):
                 i = outer_first[p]
                 j = outer_second[p]
