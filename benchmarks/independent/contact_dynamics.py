@@ -165,13 +165,6 @@ def _root(parent, grain):
 
 
 @compiled
-def _fall(row, rows, kick_x, kick_y, i, j):
-    """Minus the normal velocity of a contact after the kicks, times the reduced mass."""
-    across = rows[row] * (kick_x[j] - kick_x[i])
-    return across + rows[row + np.uint64(1)] * (kick_y[j] - kick_y[i]) - rows[row + np.uint64(6)]
-
-
-@compiled
 def _gauss_seidel(first, second, rows, impulse, kick_x, kick_y, start, stop, target):
     """Impulses of one cluster by projected Gauss-Seidel: 0 <= p, w = W p + u >= 0, p w = 0.
 
@@ -189,7 +182,11 @@ def _gauss_seidel(first, second, rows, impulse, kick_x, kick_y, start, stop, tar
             i = first[c]
             j = second[c]
             old = impulse[c]
-            fall = _fall(row, rows, kick_x, kick_y, i, j)
+            fall = (
+                rows[row] * (kick_x[j] - kick_x[i])
+                + rows[row + np.uint64(1)] * (kick_y[j] - kick_y[i])
+                - rows[row + np.uint64(6)]
+            )
             change = max(relax * fall, -old)
             if change != 0.0:
                 impulse[c] = old + change
@@ -205,7 +202,11 @@ def _gauss_seidel(first, second, rows, impulse, kick_x, kick_y, start, stop, tar
                 row = np.uint64(ROW) * c
                 i = first[c]
                 j = second[c]
-                fall = _fall(row, rows, kick_x, kick_y, i, j)
+                fall = (
+                    rows[row] * (kick_x[j] - kick_x[i])
+                    + rows[row + np.uint64(1)] * (kick_y[j] - kick_y[i])
+                    - rows[row + np.uint64(6)]
+                )
                 residual = min(impulse[c], -fall) * rows[row + np.uint64(7)]
                 true += residual * residual
             if true <= target:
@@ -396,7 +397,8 @@ def _run(x, y, vx, vy, radii, masses, side, tilt, law, steps, room, sums):
                     pairs += 1
             blocks = (pairs + BLOCK - 1) // BLOCK
             for p in range(pairs, blocks * BLOCK):  # pairs that never meet fill the last block
-                parabola[p // BLOCK, :, p % BLOCK] = FAR, 0.0, 0.0
+                parabola[p // BLOCK, 0, p % BLOCK] = FAR
+                parabola[p // BLOCK, 1:, p % BLOCK] = 0.0
             rate = 2.0 * fastest + abs(shear_rate) * (largest + inner_skin)
 
         sums[KINETIC] += sxx
