@@ -24,11 +24,11 @@ COMMANDS = {
     "help": "--help",
     "info": "info",
     "run, strain 0.5": "run --restitution 0.5 --packing-fraction 0.7 --strain 0.5 --quiet",
-    "map, quick preset": f"map --output {MAP} --quiet",
+    "map, quick preset": f"map --output {MAP} --overwrite --quiet",
     "plot": f"plot {MAP}",
 }
 SMALL_MAP = (
-    f"map --restitution 0.3,0.7 --packing-fraction 0.5,0.6 --grains 32 --output {MAP} --quiet"
+    f"{COMMANDS['map, quick preset']} --restitution 0.3,0.7 --packing-fraction 0.5,0.6 --grains 32"
 )
 _SAMPLE = """
 import time, statistics, jax
