@@ -67,9 +67,7 @@ def in_a_process(folder: Path, *arguments: str) -> Outcome:
 def made_up_replicas(
     statuses: dict[tuple[int, int], Status], end: type[BaseException] | None = None
 ) -> Callable:
-    """A stand-in for the sweep that yields replicas with given statuses and then perhaps stops with
-    an exception.
-    """
+    """A stand-in for the sweep: replicas of given statuses, and then perhaps an exception."""
 
     def replicas(settings, missing, workers, report, *_, **__) -> Iterator:
         rng = np.random.default_rng(0)
@@ -85,9 +83,7 @@ def made_up_replicas(
 
 
 def write_few_variables(patch: pytest.MonkeyPatch, *more: str) -> None:
-    """Files of maps have the ratios and what is named: to write and read all variables takes a
-    second or two.
-    """
+    """Files of maps have the ratios and what is named; all variables take a second or two."""
     whole, names = results.write_dataset, ("force_ratio", "stress_ratio", *more)
     kept = {
         f"{name}{end}"

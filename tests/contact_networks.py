@@ -89,9 +89,7 @@ def chain(discs: int) -> Network:
 
 
 def size_ratio(big: int, seed: int) -> Network:
-    """Discs of diameter 10 in a row, each with a full ring of 34 discs of diameter 1, which touch
-    where rings meet.
-    """
+    """Discs of diameter 10 in a row, each with a full ring of 34 of diameter 1, which touch."""
     angles = 2 * np.pi * np.arange(34) / 34
     ring = np.concatenate([[[0.0, 0.0]], 5.5 * np.stack([np.cos(angles), np.sin(angles)], axis=-1)])
     positions = np.concatenate([ring + np.array([[12.0 * k, 0]]) for k in range(big)])
@@ -101,9 +99,7 @@ def size_ratio(big: int, seed: int) -> Network:
 
 
 def mass_ratio(side: int, seed: int) -> Network:
-    """A square of touching discs whose masses are 1 and 10⁴ in turn, as on a chessboard, with
-    random velocities.
-    """
+    """A square of touching discs with masses 1 and 10⁴, as on a chessboard."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(side), np.arange(side)))
     masses = np.where((x + y) % 2, 1e4, 1.0)
     positions = np.stack([x, y], axis=-1).astype(float)

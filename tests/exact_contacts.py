@@ -181,9 +181,7 @@ def is_obstacle(g: np.ndarray, approach: np.ndarray, weights: np.ndarray) -> boo
 
 
 def _after(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> np.ndarray:
-    """w = G Gᵀ J + u⁻ in the longest numbers that NumPy has; it adds them without the processor's
-    linear algebra.
-    """
+    """w = G Gᵀ J + u⁻ in the longest numbers of NumPy, added without linear algebra."""
     wide = g.astype(np.longdouble)
     return wide @ (impulses.astype(np.longdouble) @ wide) + approach
 

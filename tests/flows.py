@@ -1,6 +1,4 @@
-"""Flows of ``GRAINS`` grains that tests share; engines that are compiled once for them; when two
-runs are the same.
-"""
+"""Flows of ``GRAINS`` grains, engines that are compiled once for them, and when runs are the same."""
 
 from dataclasses import replace
 from functools import cache
@@ -50,6 +48,11 @@ def of_state(flow: ShearFlow, state: State) -> ShearFlow:
     return replace(flow, packing_fraction=packing_fraction) if accepted else flow
 
 
+def arrays(*trees: Any) -> Any:
+    """The same numbers as arrays, for which all calls of a compiled function are one program."""
+    return jax.tree.map(np.asarray, trees)
+
+
 def flow_of(packing_fraction=0.6, **change) -> ShearFlow:
     """A flow of the shared number of grains."""
     numbers = {"restitution": 0.5, "timestep": 1e-3}
@@ -79,9 +82,7 @@ def assert_same_state(one, two, atol: float):
 
 
 def assert_same_tally(one: Tally, two: Tally, rtol: float, but: tuple[str, ...] = ()):
-    """Counts agree exactly, sums to a share of the sum itself, and moments to a share of their
-    largest component.
-    """
+    """Counts agree exactly, sums to a share of the sum, moments to one of their largest part."""
     for name in COUNTS:
         assert getattr(one, name) == getattr(two, name), name
     for name in set(TABLE) - {*COUNTS, *OF_THE_SOLVER, *but}:
@@ -106,9 +107,7 @@ ENGINES = ("numba", "jax")
 
 @pytest.fixture(scope="session")
 def run():
-    """``run(flow, state, steps, free_flight=True, solver=EXACT)``: the advance by JAX alone,
-    compiled.
-    """
+    """``run(flow, state, steps, free_flight=True, solver=EXACT)``: the compiled engine ``Jax``."""
     compiled = jax.jit(advance_by_jax, static_argnames="free_flight")
 
     def call(
@@ -118,11 +117,8 @@ def run():
         free_flight: bool = True,
         solver: ProjectedMethod = EXACT,
     ):
-        return jax.block_until_ready(
-            compiled(
-                of_state(flow, state), solver, state, jnp.int32(steps), free_flight=free_flight
-            )
-        )
+        numbers = arrays(of_state(flow, state), solver, state, np.int32(steps))
+        return jax.block_until_ready(compiled(*numbers, free_flight=free_flight))
 
     return call
 
@@ -136,7 +132,7 @@ def engines(run):
 
         def run(flow: ShearFlow, state: State, steps: int, solver: ProjectedMethod = EXACT):
             return jax.block_until_ready(
-                call(of_state(flow, state), solver, state, jnp.int32(steps))
+                call(*arrays(of_state(flow, state), solver, state, np.int32(steps)))
             )
 
         return run
@@ -179,9 +175,7 @@ def packed():
 
 @pytest.fixture(scope="session")
 def flowing(packed, run):
-    """``flowing(packing_fraction, seed=0)``: the same after a strain of one, with zero total
-    momentum.
-    """
+    """``flowing(packing_fraction, seed=0)``: that after a strain of one, without momentum."""
 
     @cache
     def flow_state(packing_fraction: float, seed: int = 0) -> State:

@@ -43,9 +43,7 @@ def ratio_dataset(alphas: int = 5, nus: int = 6, relative_error: float = 0.05) -
 
 
 def with_timesteps(data: xr.Dataset, *timesteps: float) -> xr.Dataset:
-    """Return a map of several time steps whose excess is that of a map at the first and twice as
-    large at each next.
-    """
+    """Return a map of several time steps whose excess is twice as large at each next."""
     parts = [
         data.assign(force_ratio=1.0 + 2.0**k * (data.force_ratio - 1.0))
         for k in range(len(timesteps))
@@ -55,9 +53,7 @@ def with_timesteps(data: xr.Dataset, *timesteps: float) -> xr.Dataset:
 
 
 def with_grains(data: xr.Dataset, *grains: int, noise: float = 0.01) -> xr.Dataset:
-    """Return a map of several numbers of grains, whose averages grow by different shares for a
-    factor of four.
-    """
+    """Return a map of several numbers of grains; averages grow by shares for a factor of four."""
     random, dims, parts = np.random.default_rng(0), data.force_ratio.dims, []
     growth = {
         "pressure": 0.10,
@@ -98,9 +94,7 @@ def closure_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
 
 
 def factor_of(k: int, x: np.ndarray, nu: np.ndarray) -> np.ndarray:
-    """Return the logarithm of synthetic factor k of a stress; the first is within its error
-    everywhere.
-    """
+    """Return the logarithm of synthetic factor k of a stress; the first is within its error."""
     return 0.5 * STDERR * (x - x) if k == 0 else (-1.0) ** k * (0.4 * k * x + 0.5 * (nu - 0.55))
 
 
@@ -114,9 +108,7 @@ def share_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
 
 
 def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
-    """Return a synthetic map with stresses, what a theory predicts of them, and shares of
-    clusters.
-    """
+    """Return a synthetic map with stresses, predictions of a theory, and shares of clusters."""
     data = ratio_dataset(alphas, nus)
     x, nu = 1.0 - data.restitution.values[None, :], data.packing_fraction.values[:, None]
     tensors = {

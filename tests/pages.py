@@ -18,9 +18,7 @@ MARKUP = (
 
 @cache
 def page_map() -> xr.DataTree:
-    """A map of 2 time steps × 2 × 3 points: one is bad, one was not run, and names and attributes
-    hold markup.
-    """
+    """A map of 2 × 2 × 3 points: one is bad, one was not run; names and attributes hold markup."""
     settings = MapSettings(
         (0.5, 0.7, 0.9),
         (0.5, 0.6),

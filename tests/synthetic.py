@@ -1,6 +1,4 @@
-"""Made-up tallies, replicas and snapshots, for tests of what happens to the numbers after the
-flow.
-"""
+"""Made-up tallies, replicas and snapshots, for tests of what follows after the flow."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,9 +28,7 @@ SNAPSHOTS = (
 
 
 def random_tally(rng: np.random.Generator, *shape: int, status: int = 0) -> Tally:
-    """Return a tally of positive random sums, of whole numbers of steps and contacts, with any
-    leading axes.
-    """
+    """Return a tally of positive sums, of whole steps and contacts, with any leading axes."""
     counts = (
         "steps",
         "contacts",
@@ -83,9 +79,7 @@ def sample_of_tally(tally: Tally, flow: ShearFlow) -> Sample:
 
 
 def random_instant(seed: int, grains: int = 20, pairs: int = 7) -> ForceNetwork:
-    """Return an instant of grains at random places in a cell of side 10, with pairs of random
-    forces.
-    """
+    """Return grains at random places in a cell of side 10, with pairs of random forces."""
     rng = np.random.default_rng(seed)
     return ForceNetwork(
         positions=rng.uniform(-5, 5, (grains, 2)),
@@ -119,9 +113,7 @@ def one_sentence(message: str) -> bool:
 
 @contextmanager
 def refused(words: str = ".") -> Iterator[pytest.ExceptionInfo]:
-    """What a user gives is refused by an ``InputError`` of one sentence, in which the words are
-    found.
-    """
+    """An ``InputError`` of one sentence, in which the words are found, is raised."""
     with pytest.raises(InputError, match=words) as caught:
         yield caught
     assert one_sentence(str(caught.value))
@@ -130,9 +122,7 @@ def refused(words: str = ".") -> Iterator[pytest.ExceptionInfo]:
 def snapshot_of(
     positions, contacts=None, velocities=None, radii=0.5, side=40.0, tilt=0.0, shear_rate=1.0
 ) -> Snapshot:
-    """Snapshots of grains at (times, grains, 2), with contacts (i, j, impulse) of each time, at
-    unit time step.
-    """
+    """Snapshots of (times, grains, 2), with contacts (i, j, impulse) of each, at unit time step."""
     positions = np.asarray(positions, float)
     times, grains = positions.shape[:2]
     radii = np.broadcast_to(np.asarray(radii, float), (times, grains))

@@ -128,9 +128,7 @@ def sampled(strain: float, engine: jg.Jax | None = None, **numbers: float) -> jg
 
 
 def assert_agree(sample: jg.Sample, expected: dict, scale: float = 1.0) -> None:
-    """Averages are those expected, with their standard errors, within four of both, which are
-    small.
-    """
+    """Averages are those expected within four standard errors of both, which are small."""
     for name, (value, error) in expected.items():
         own, stderr = getattr(sample, name) / scale, sample.errors()[name] / scale
         both = np.hypot(stderr, error)

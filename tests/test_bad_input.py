@@ -1,6 +1,4 @@
-"""Bad input of any kind ends with one sentence that says what is accepted: nothing runs, and no
-file is left behind.
-"""
+"""Bad input ends with one sentence on what is accepted: nothing runs, no file is left behind."""
 
 import inspect
 import os

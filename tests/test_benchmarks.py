@@ -1,6 +1,4 @@
-"""All benchmarks are run by one command, their results are used, and what the charts judge by is
-right.
-"""
+"""One command runs all benchmarks, their results are used, and charts judge rightly."""
 
 import inspect
 import subprocess

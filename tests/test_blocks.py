@@ -1,6 +1,4 @@
-"""A long batch that was cut off anywhere goes on from its blocks with the bits that it would have
-had.
-"""
+"""A long batch that was cut off anywhere goes on from its blocks to the same bits."""
 
 from pathlib import Path
 from typing import Any

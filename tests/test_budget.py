@@ -1,6 +1,4 @@
-"""Averages of a large system: the parts of their errors follow from laws, and the laws hold for
-what was measured.
-"""
+"""Averages of a large system: parts of errors follow from laws, which hold for measured ones."""
 
 import json
 from pathlib import Path
@@ -69,9 +67,7 @@ def test_an_average_less_what_is_missing_is_the_one_at_its_number_of_grains() ->
 
 
 def test_size_errors_of_force_ratio_and_friction_are_shares_of_that_of_the_pressure() -> None:
-    """The excess of a force ratio has 1.2 times the error of the pressure and so has another tenth,
-    and the friction 0.9 times.
-    """
+    """The excess of a force ratio has 1.2 times the pressure's and another tenth, friction 0.9."""
     estimates = large(grains=256)
     share = estimates["pressure"].sources["size"] / estimates["pressure"].value
     excess, friction = (estimates[name] for name in ("force_ratio", "macroscopic_friction"))
@@ -131,9 +127,7 @@ def checks_of(average: str) -> list[dict]:
 
 @pytest.mark.parametrize("average", LARGE_SYSTEM)
 def test_flows_with_more_grains_are_within_the_intervals(average: str) -> None:
-    """Ratios of averages at two N that the law was not fitted to, as often as in intervals of
-    95 %.
-    """
+    """Ratios of averages that the law was not fitted to, as often as in intervals of 95 %."""
     checks = checks_of(average)
     flows = sum(row["flows"] for row in checks)
     within = sum(row["flows"] * row["within"] for row in checks)

@@ -1,6 +1,4 @@
-"""Compiled programs are kept in the user's cache folder, in a temporary one, or nowhere: everything
-runs.
-"""
+"""Compiled programs are kept in the user's folder, in a temporary one, or nowhere."""
 
 import os
 import subprocess

@@ -1,6 +1,4 @@
-"""The calendar of the numba engine: blocks with bounds find the events that a pass over all entries
-finds.
-"""
+"""The calendar of the numba engine: its blocks find the events of a pass over all entries."""
 
 import numpy as np
 import pytest
@@ -15,9 +13,7 @@ ENTRIES, CHANGES = 37 * LANES, 9
 
 @njit
 def events(shift, changed, entries, pairs, met, found):
-    """Visit the events of a calendar, each of which changes some entries; writes the step and the
-    contacts of each.
-    """
+    """Visit the events, each of which changes some entries; write step and contacts of each."""
     if shift > 0:
         calendar.bound_blocks(ENTRIES, shift, pairs)
     for event in range(found.shape[0]):

@@ -388,9 +388,7 @@ def test_help_teaches_by_examples_that_are_accepted(command: str, tmp_path: Path
 
 
 def test_given_options_replace_what_a_file_chose_for_its_error() -> None:
-    """Grains by point hold for the points of the file only, and either a strain or an error
-    holds.
-    """
+    """Grains by point are those of the file's points; either a strain or an error holds."""
     chosen = {"restitution": (0.5,), "grains": 512, "grains_by_point": (512,), "error": 0.1}
     assert combined(chosen, {}) == chosen
     more = {"restitution": (0.2, 0.5)}

@@ -1,6 +1,4 @@
-"""The constitutive law of the reference map: scaling, balance of energy, derivatives, range, file
-and example.
-"""
+"""The constitutive law: scaling, balance of energy, derivatives, range, file and example."""
 
 import re
 from pathlib import Path
@@ -49,17 +47,16 @@ def test_power_of_the_shear_is_dissipated_within_the_errors() -> None:
     assert np.all(apart < 0.05 * loss.value)
 
 
+slope = jax.jit(jax.grad(lambda x: LAW(x[0], x[1]).pressure.value))
+hessian = jax.jit(jax.jacfwd(slope))
+
+
 @pytest.mark.parametrize("at", [(0.5, 0.6), (0.9, 0.7), (0.47, 0.61)])
 def test_second_derivatives_are_those_of_finite_differences(at: tuple[float, float]) -> None:
     """At a point of the reference map, and between its points."""
     change, e = np.eye(2), 1e-3
-
-    def slope(where: Any) -> Any:
-        return jax.grad(lambda x: LAW(x[0], x[1]).pressure.value)(where)
-
-    hessian = jax.jit(jax.jacfwd(slope))(jnp.array(at))
     differences = [(slope(at + e * x) - slope(at - e * x)) / (2 * e) for x in change]
-    np.testing.assert_allclose(hessian, differences, rtol=2e-3, atol=0.1)
+    np.testing.assert_allclose(hessian(jnp.array(at)), differences, rtol=2e-3, atol=0.1)
 
 
 def test_long_waves_raise_the_granular_temperature() -> None:
@@ -77,9 +74,7 @@ def test_correlations_vanish_towards_elastic_grains_and_grow_with_dissipation() 
 
 
 def test_length_follows_from_correlated_velocities_where_collisions_are_binary() -> None:
-    """Grains that approach more slowly by a factor f have f² of the contact pressure and f³ of the
-    loss: L′ = 1/f.
-    """
+    """An approach slower by a factor f has f² of the pressure and f³ of the loss: L′ = 1/f."""
     alphas, nus = (x.ravel() for x in np.broadcast_arrays(*a_plane()))
     answer = jg.validity(alphas, nus)
     binary = answer.measured["force_ratio"].value < 1.01

@@ -1,6 +1,4 @@
-"""The rule that makes a pair a contact, and the time of first contact, against flights followed in
-small steps.
-"""
+"""The rule of contact, and the time of first contact, against flights in small steps."""
 
 import jax
 import jax.numpy as jnp
@@ -23,9 +21,7 @@ compiled_rule, compiled_time, compiled_network = map(
 
 
 def flights(seed: int, speed: float = 10.0):
-    """Pairs around contact, overlapping or not, with any velocity: separations, relative
-    velocities, reaches.
-    """
+    """Pairs around contact, of any velocity: separations, relative velocities, reaches."""
     rng = np.random.default_rng(seed)
     angles, reach = rng.uniform(0, 2 * np.pi, PAIRS), rng.uniform(0.74, 1.26, PAIRS)
     distance = reach + rng.normal(size=PAIRS) * 10 ** rng.uniform(-6, -1, PAIRS)
@@ -95,9 +91,7 @@ def test_time_of_first_contact_is_exact(seed):
 @modest
 @seeds
 def test_rule_and_time_of_first_contact_agree(seed):
-    """An approaching pair is a contact just when its first contact comes within the look-ahead
-    time.
-    """
+    """An approaching pair is a contact just when it meets within the look-ahead time."""
     separations, velocities, reach = flights(seed)
     time, _ = (np.asarray(found) for found in compiled_time(motion(separations, velocities), reach))
     for look_ahead in (1e-3, 1e-2):

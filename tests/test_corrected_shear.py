@@ -1,6 +1,4 @@
-"""The corrected theory: its limits, the balance of energy, its laws, and errors that hold at other
-flows.
-"""
+"""The corrected theory: limits, balance of energy, laws, and errors at other flows."""
 
 import json
 from functools import cache
@@ -22,6 +20,12 @@ PLANE = [
     for axis in np.meshgrid([0.0, 0.1, 0.3, 0.6, 0.9, 0.99], [0.01, 0.1, 0.4, 0.7, 0.83])
 ]
 STATE = ("granular_temperature", "pressure", "shear_stress", "dissipation_rate")
+
+
+@jax.jit
+def sheared(alpha, nu, rate=1.0, polydispersity=0.26) -> CorrectedShear:
+    """The theory of one flow, compiled once for all tests."""
+    return corrected_shear(alpha, nu, rate, polydispersity)
 
 
 @cache
@@ -51,7 +55,7 @@ def test_the_power_of_the_shear_is_dissipated() -> None:
 def test_dissipation_is_enskogs_times_pairs_over_length() -> None:
     """Of grains of one size, whose temperature tensor follows from stress and temperature."""
     alpha, nu = 0.4, 0.6
-    predicted = corrected_shear(alpha, nu, polydispersity=0.0)
+    predicted = sheared(alpha, nu, polydispersity=0.0)
     density, total = 4 * nu / np.pi, np.array([predicted.pressure, predicted.shear_stress])
 
     def stresses(tensor):
@@ -66,16 +70,11 @@ def test_dissipation_is_enskogs_times_pairs_over_length() -> None:
 
     unknowns = jnp.array([0.1, -0.2]) * predicted.granular_temperature
     misfit = jax.jit(lambda x: jnp.stack([stresses(tensor_of(x))[0][1], stresses(tensor_of(x))[1]]))
-    target = jnp.stack(
-        [
-            total[1],
-            predicted.dissipation_rate * predicted.correlation_length / predicted.pair_factor,
-        ]
-    )
+    slopes = jax.jit(jax.jacfwd(misfit))
+    loss = predicted.dissipation_rate * predicted.correlation_length / predicted.pair_factor
+    target = jnp.stack([total[1], loss])
     for _ in range(20):  # Newton: two unknowns of the tensor, from shear stress and dissipation
-        unknowns = unknowns - jnp.linalg.solve(
-            jax.jacfwd(misfit)(unknowns), misfit(unknowns) - target
-        )
+        unknowns = unknowns - jnp.linalg.solve(slopes(unknowns), misfit(unknowns) - target)
     np.testing.assert_allclose(misfit(unknowns), target, rtol=1e-10)
     np.testing.assert_allclose(
         stresses(tensor_of(unknowns))[0][0], total[0], rtol=1e-8
@@ -83,26 +82,24 @@ def test_dissipation_is_enskogs_times_pairs_over_length() -> None:
 
 
 def test_stresses_grow_with_the_square_of_the_shear_rate() -> None:
-    slow, fast = corrected_shear(0.5, 0.6), corrected_shear(0.5, 0.6, 3.0)
-    for name, times in {
-        "granular_temperature": 9,
-        "pressure": 9,
-        "shear_stress": 9,
-        "dissipation_rate": 27,
-    }.items():
+    slow, fast = sheared(0.5, 0.6), sheared(0.5, 0.6, 3.0)
+    for name, times in zip(STATE, (9, 9, 9, 27), strict=True):
         np.testing.assert_allclose(getattr(fast, name), times * getattr(slow, name), rtol=1e-12)
     np.testing.assert_allclose(fast.correlation_length, slow.correlation_length)
 
 
+@jax.jit
+def logs(x):
+    predicted = corrected_shear(x[0], x[1])
+    return jnp.log(jnp.stack([getattr(predicted, name) for name in STATE[:3]]))
+
+
+slopes_of_logs = jax.jit(jax.jacrev(logs))
+
+
 @pytest.mark.parametrize("point", [(0.2, 0.3), (0.9, 0.8)])
 def test_derivatives_equal_finite_differences(point: tuple[float, float]) -> None:
-    def logs(x):
-        predicted = corrected_shear(x[0], x[1])
-        return jnp.log(
-            jnp.stack([predicted.granular_temperature, predicted.pressure, predicted.shear_stress])
-        )
-
-    derivatives = jax.jacrev(logs)(jnp.array(point))
+    derivatives = slopes_of_logs(jnp.array(point))
     steps = 1e-5 * np.eye(2)
     expected = [(logs(point + step) - logs(point - step)) / 2e-5 for step in steps]
     np.testing.assert_allclose(derivatives.T, expected, rtol=1e-6)
@@ -110,15 +107,14 @@ def test_derivatives_equal_finite_differences(point: tuple[float, float]) -> Non
 
 def test_grains_become_those_of_the_theory_in_the_elastic_limit() -> None:
     """L → 1 as 1 − α, R → 1 as its cube root, in dilute flow."""
-    near, nearer = (corrected_shear(1 - x, 0.1) for x in (1e-3, 1e-6))
+    near, nearer = (sheared(1 - x, 0.1) for x in (1e-3, 1e-6))
     np.testing.assert_allclose(
         (near.correlation_length - 1) / (nearer.correlation_length - 1), 1e3, rtol=0.05
     )
     np.testing.assert_allclose((near.pair_factor - 1) / (nearer.pair_factor - 1), 10, rtol=1e-3)
 
 
-# ----------------------------------------------------------------------------- the committed
-# results
+# The committed results
 
 
 @cache
@@ -136,16 +132,9 @@ def test_the_coefficients_are_those_of_the_benchmark() -> None:
 
 def predicted_over_measured(points: list[dict], predicted: CorrectedShear) -> np.ndarray:
     """Logarithms for temperature, pressure and shear stress, (3, points)."""
-    measured = np.array(
-        [
-            [point[name] for point in points]
-            for name in ("local_temperature", "pressure", "shear_stress")
-        ]
-    )
-    return np.log(
-        np.array([predicted.granular_temperature, predicted.pressure, predicted.shear_stress])
-        / measured
-    )
+    names = "local_temperature", "pressure", "shear_stress"
+    measured = np.array([[point[name] for point in points] for name in names])
+    return np.log(np.array([getattr(predicted, name) for name in STATE[:3]]) / measured)
 
 
 def test_errors_at_flows_that_were_not_fitted_have_the_size_that_is_quoted() -> None:

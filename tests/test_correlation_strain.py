@@ -1,6 +1,4 @@
-"""The correlation strain of a flow: the longer of heating by the shear and of a sound wave across
-the cell.
-"""
+"""Correlation strain: the longer of heating by the shear and of a sound wave across the cell."""
 
 from dataclasses import replace
 

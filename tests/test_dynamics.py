@@ -1,6 +1,4 @@
-"""The advance over many steps: exact flight, the same trajectory by every route, statuses,
-batch_advance.
-"""
+"""The advance over many steps: exact flight, one trajectory by every route, statuses."""
 
 from dataclasses import replace
 
@@ -41,9 +39,7 @@ UNCHANGED = {"numba": 0, "jax": 4 * EPS}
 
 
 def test_grain_flies_straight_in_the_laboratory(engine_run, scene):
-    """Over many steps, three remaps of the tilt and across the boundary, where the image is faster
-    by γ̇L.
-    """
+    """Over three remaps of the tilt and the boundary, where the image is faster by γ̇L."""
     state = scene([[3.0, 4.0]], [[0.5, 1.7]])
     flow, steps = flow_of(0.02), 3200
     after, tally = engine_run(flow, state, steps)
@@ -257,9 +253,7 @@ def equations_of(jaxpr) -> list:
 
 
 def test_control_flow_of_a_batch_stays_control_flow(traced_batch):
-    """A branch or loop on a predicate that differs between replicas would pay for all branches, for
-    all replicas.
-    """
+    """A predicate that differs between replicas would pay for all branches, for all replicas."""
     least = 3 + len(
         contact_buffers(GRAINS)
     )  # the loops over lists and events, and a solve of each size and of all

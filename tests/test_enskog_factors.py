@@ -1,6 +1,4 @@
-"""Stresses and dissipation rate are Enskog's times five factors, each of which is one where its
-assumption holds.
-"""
+"""Measured rates are Enskog's times five factors, each one where its assumption holds."""
 
 from dataclasses import replace
 

@@ -1,6 +1,4 @@
-"""The event-driven reference obeys conservation laws, Enskog's rate and its own law of a
-collision.
-"""
+"""The event-driven reference obeys conservation laws, Enskog's rate and its own collision."""
 
 import numpy as np
 import pytest
@@ -14,9 +12,7 @@ ROUNDING = 1e-12
 def lattice(
     across: int, packing_fraction: float, polydispersity: float = 0.26, seed: int = 0
 ) -> Discs:
-    """Discs on a square lattice, with random velocities of temperature one and no total
-    momentum.
-    """
+    """Discs on a square lattice, with random velocities of temperature one, without momentum."""
     rng, count = np.random.default_rng(seed), across**2
     diameters = rng.permutation(1 + polydispersity * (2 * (np.arange(count) + 0.5) / count - 1))
     side = np.sqrt(np.pi / 4 * np.sum(diameters**2) / packing_fraction)
@@ -59,9 +55,7 @@ def test_power_of_the_shear_is_dissipated_or_heats_the_discs(flow) -> None:
 
 @pytest.mark.parametrize("move", [(0.0, 3.7), (1.3, -12.1)])
 def test_flow_is_the_same_everywhere(move) -> None:
-    """Moved by any vector, through the sheared boundary too, the same discs collide at the same
-    times.
-    """
+    """Moved by any vector, also through the boundary, discs collide at the same times."""
     law, before = Law(0.5, 1e-3), lattice(10, 0.5, seed=1)
     _, sums = sheared(before, law, 0.4, blocks=2)
     _, moved = sheared(before._replace(positions=before.positions + move), law, 0.4, blocks=2)
@@ -70,9 +64,7 @@ def test_flow_is_the_same_everywhere(move) -> None:
 
 
 def test_elastic_gas_has_the_rate_and_pressure_of_enskog() -> None:
-    """ω = 2 n σ χ √(πT/m), p = nT (1 + 2νχ), with Henderson's χ, which is exact to 0.3 % at this
-    packing fraction.
-    """
+    """ω = 2 n σ χ √(πT/m), p = nT (1 + 2νχ), with Henderson's χ, exact to 0.3 % here."""
     fraction, count = 0.3, 400
     gas, _ = sheared(lattice(20, fraction, polydispersity=0.0), Law(1.0, shear_rate=0.0), 10.0)
     gas, sums = sheared(gas, Law(1.0, shear_rate=0.0), 80.0, blocks=16)

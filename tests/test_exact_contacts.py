@@ -1,6 +1,4 @@
-"""The reference of other tests: exact solutions agree with closed forms, and what is wrong is
-refused.
-"""
+"""The reference of other tests: solutions agree with closed forms; wrong ones are refused."""
 
 import numpy as np
 import pytest
@@ -37,9 +35,7 @@ jammed = pytest.mark.parametrize("network", JAMMED.values(), ids=JAMMED)
 
 
 def test_three_discs_in_a_row() -> None:
-    """One that hits two: at restitution zero all go on together; at one they leave as −1/3, 2/3,
-    2/3.
-    """
+    """One hits two: at restitution zero all go on as one; at one they leave as −1, 2, 2 thirds."""
     changes = exact_changes(*chain(3))[:3, 0]
     np.testing.assert_allclose(np.array([1, 0, 0]) + changes, 1 / 3, rtol=4 * EPS)
     np.testing.assert_allclose(
@@ -49,9 +45,7 @@ def test_three_discs_in_a_row() -> None:
 
 @pytest.mark.parametrize("rings", [1, 2, 3])
 def test_pressed_hexagon_stops(rings: int) -> None:
-    """W is singular; the changes undo the compression, which moves every grain by its place from
-    the centre.
-    """
+    """W is singular; the changes undo the compression, which moves a grain by its place."""
     network = hexagonal(rings, struck=False)
     g, approach = weighted(*network)
     assert np.linalg.matrix_rank(g) < len(g)

@@ -44,9 +44,7 @@ def seen(flowing, run) -> Snapshot:
 
 @pytest.fixture(scope="module")
 def points(seen) -> jax.Array:
-    """Some points in images of the cell near and far, among them a grain and the middle of a
-    branch.
-    """
+    """Points in images near and far, among them a grain and the middle of a branch."""
     anywhere = np.random.default_rng(0).uniform(-2, 3, (38, 2)) * float(seen.state.side)
     contact = int(jnp.argmax(seen.impulses))
     centre = seen.state.positions[seen.contacts.j[contact]]
@@ -102,9 +100,7 @@ def fluxes(fields: Fields) -> jax.Array:
 
 
 def outflow(fields_of, points: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Divergence (points, 4) of the fluxes of a function that gives fields at points, and the
-    dissipation.
-    """
+    """Divergence (points, 4) of the fluxes of fields at points, and the dissipation."""
 
     def flux(points):
         fields = fields_of(points)
@@ -183,9 +179,7 @@ def test_collisions_hand_over_momentum_and_energy_along_their_branches(seen, poi
 def test_a_step_of_the_engine_is_balanced_to_the_order_of_its_flight(
     flowing, run, seen, points
 ) -> None:
-    """With the fields of the snapshot to first order in dt; with the carried fluxes of mid-flight
-    to second order.
-    """
+    """With the fields of the snapshot to first order in dt; with fluxes of mid-flight to second."""
     width, residuals = WIDTH, []
     for timestep in (1e-3, 5e-4, 2.5e-4):
         flow = replace(FLOW, timestep=timestep)
@@ -245,9 +239,7 @@ def test_averages_over_the_cell_are_the_virial_sums(seen) -> None:
 
 
 def test_fields_are_those_of_every_image(seen, points) -> None:
-    """At r + lattice vector the velocity has γ̇L more for every row; wrapping or moving grains to
-    images is nothing.
-    """
+    """At r + lattice vector the velocity has γ̇L more a row; images of grains are nothing."""
     width, side, tilt = 0.3, seen.state.side, seen.state.tilt
     here = fields_at(seen, points, width)
     for columns, rows in ((1, 0), (0, 1), (-3, 2)):
@@ -313,9 +305,7 @@ def test_two_discs_that_collide_have_known_fields(scene) -> None:
 def test_temperature_has_nothing_of_the_mean_flow_whose_share_of_the_kinetic_stress_is_known(
     seen, width: float
 ) -> None:
-    """Grains that move with the mean flow are cold; others have the weighted variance of their
-    peculiar velocities.
-    """
+    """The mean flow is cold; other grains have the weighted variance of peculiar velocities."""
     still = replace(seen.state, velocities=jnp.zeros_like(seen.state.velocities))
     points = grid(still.side, 24)
     cold = flight_fields_at(still, points, width)
@@ -335,9 +325,7 @@ def test_temperature_has_nothing_of_the_mean_flow_whose_share_of_the_kinetic_str
 
 
 def virial_stress(seen: Snapshot) -> np.ndarray:
-    """Σ^{yb} of a step: of the contacts, and of the grains on average over their flight, where c_x
-    falls by γ̇ c_y t.
-    """
+    """Σ^{yb}: of the contacts, and of the grains over their flight, where c_x falls by γ̇ c_y t."""
     area, dt = float(seen.state.side) ** 2, float(seen.timestep)
     normals, pushed = (
         np.asarray(seen.contacts.normals),
@@ -349,9 +337,7 @@ def virial_stress(seen: Snapshot) -> np.ndarray:
 
 
 def test_momentum_through_planes_of_all_heights_is_the_virial_stress(seen) -> None:
-    """The flux is linear in the height between the heights at which a branch or a flight begins or
-    ends.
-    """
+    """The flux is linear between the heights at which a branch or a flight begins or ends."""
     side, y = float(seen.state.side), np.asarray(seen.state.positions)[:, 1]
     start = y[np.asarray(seen.contacts.j)]
     rise = np.asarray(seen.contacts.normals)[:, 1] * np.asarray(seen.contacts.distances)

@@ -39,9 +39,7 @@ def error_bars(figure: Figure, panel: int = 0) -> list[np.ndarray]:
 
 
 def with_stress_ratio(data: xr.Dataset) -> xr.Dataset:
-    """Return the map with a ratio of the stresses whose excess is twice that of the force ratio in
-    component xy.
-    """
+    """Return the map with a ratio of stresses of twice the excess in component xy."""
     factors = xr.DataArray([[1.0, 2.0], [2.0, 1.0]], dims=("axis_a", "axis_b"))
     ratio, error = 1.0 + (data.force_ratio - 1.0) * factors, data.force_ratio_stderr * factors
     return data.assign(stress_ratio=ratio, stress_ratio_stderr=error)

@@ -8,9 +8,7 @@ from jaxgran.files import file_lock
 
 
 def test_who_waits_for_a_file_that_is_removed_does_not_enter_with_the_next(tmp_path: Path) -> None:
-    """The first removes the file of the lock and leaves; the second has waited for it, the third
-    makes a new one.
-    """
+    """The first removes the lock and leaves; the second has waited, the third makes a new one."""
     path, inside, most = tmp_path / "new" / "file", [], []
 
     def enter(pause: float) -> None:

@@ -1,6 +1,4 @@
-"""A restitution is found from states at both ends of short windows, and longer windows are
-refused.
-"""
+"""A restitution is found from both ends of short windows, and longer windows are refused."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -78,9 +76,7 @@ def test_error_of_a_restitution_is_that_of_the_slopes_of_what_is_seen() -> None:
 
 
 def test_states_at_the_start_are_found_better_than_they_were_seen_or_the_fit_is_refused() -> None:
-    """Noise at the start may lead to other collisions, at which the misfit stays above what noise
-    explains.
-    """
+    """Noise may lead to other collisions, where the misfit stays above what noise explains."""
     fits = {}
     for seed in range(4):
         with suppress(jg.InputError):

@@ -1,6 +1,4 @@
-"""Pictures of a flow show its grains, its forces and its cell; movies are whole, and their frames
-differ.
-"""
+"""Pictures of a flow show its grains, forces and cell; movies are whole and move."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -46,9 +44,7 @@ def drawn(network, scale: Scale | None = None) -> Axes:
 
 
 def area_within(grains: EllipseCollection, axes: Axes, points: int = 400) -> float:
-    """Share of the window that is covered, where grains do not overlap the sum over them of the
-    area inside.
-    """
+    """Share of the window that is covered: the area inside, where grains do not overlap."""
     u = (np.arange(points) + 0.5) / points
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     mesh = np.stack(np.meshgrid(left + (right - left) * u, low + (high - low) * u), axis=-1)
@@ -70,9 +66,7 @@ def bars_of(artist: PolyCollection) -> np.ndarray:
 
 @pytest.mark.parametrize("tilt", [-0.5, 0.0, 0.2])
 def test_grains_cut_at_the_edges_and_their_images_make_whole_grains(tilt: float) -> None:
-    """The parts of the images within the window sum up to the area of all grains: none is missing,
-    none twice there.
-    """
+    """Parts of images in the window have the area of all grains: none is missing, none twice."""
     snapshots = seen(tilt)
     axes = drawn(network_of(snapshots))
     grains, *_ = axes.collections

@@ -1,6 +1,4 @@
-"""Derivatives of a contact solve and of a run, against finite differences and against laws that are
-known.
-"""
+"""Derivatives of a contact solve and of a run, against differences and known laws."""
 
 from dataclasses import replace
 from functools import partial
@@ -39,9 +37,7 @@ STEPS = 40
 
 @jax.jit
 def impulses_of(approach, angles, inverse_masses, network: Contacts):
-    """Impulses of a network with given approach velocities, directions of the normals and inverse
-    masses of grains.
-    """
+    """Impulses of a network by approach velocities, directions of normals, inverse masses."""
     normals = jnp.where(
         network.used[:, None], jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1), 0
     )
@@ -87,9 +83,7 @@ def strictness(network: Contacts, masses: np.ndarray) -> float:
 @settings(max_examples=25, phases=[Phase.generate])
 @given(networks, st.sampled_from([1.0, 100.0]))
 def test_gradient_of_a_solve_is_that_of_finite_differences(network_of, heaviest):
-    """With respect to velocities, geometry and masses, wherever no contact is about to press or to
-    part.
-    """
+    """By velocities, geometry and masses, wherever no contact is about to press or to part."""
     network, masses, _ = random_network(*network_of, heaviest)
     assume(np.any(network.used) and strictness(network, masses) > 1e-3)
     used = np.asarray(network.used)
@@ -122,9 +116,7 @@ def test_gradient_of_a_solve_is_that_of_finite_differences(network_of, heaviest)
 
 
 def test_both_modes_agree_where_many_contacts_join_few_discs():
-    """Eight contacts of three discs: conjugate gradients diverge by rounding after they are near
-    the solution.
-    """
+    """Eight contacts of three discs: conjugate gradients diverge after they came near."""
     ends, rng = np.array([[0, 1], [1, 2], [0, 2]] * 3)[:8], np.random.default_rng(5)
     solver = BarzilaiBorwein(tolerance=1e-12, max_steps=20_000)
 
@@ -148,9 +140,7 @@ def test_both_modes_agree_where_many_contacts_join_few_discs():
 
 
 def test_velocities_are_differentiable_where_impulses_are_not_unique():
-    """A disc that hits a rigid hexagon of seven, which has one contact more than it takes to hold
-    it together.
-    """
+    """A disc hits a rigid hexagon of seven, which has one contact too many."""
     angles = np.arange(6) * np.pi / 3
     places = np.concatenate(
         [[[0.0, 0.0]], np.stack([np.cos(angles), np.sin(angles)], -1), [[2.0, 0.1]]]
@@ -252,9 +242,7 @@ def score_of(tilting, run):
 
 @pytest.fixture(scope="module")
 def backward(tilting, score_of, events_of):
-    """``backward(values, steps)``: value, tally and gradient of the score, in a loop with the
-    events of ``STEPS``.
-    """
+    """``backward(values, steps)``: value, tally and gradient, in a loop of ``STEPS``'s events."""
     events = events_of(STEPS)
 
     @jax.jit
@@ -278,9 +266,7 @@ def derivative(tilting, backward):
 
 @pytest.fixture(scope="module")
 def forward(tilting, score_of):
-    """``forward(values, along)``: the derivative of the score along a direction, in forward
-    mode.
-    """
+    """``forward(values, along)``: the derivative along a direction, in forward mode."""
 
     def score(values: dict):
         return score_of(exact_advance(*changed(*tilting, values), jnp.int32(STEPS))[0])
@@ -296,18 +282,13 @@ def test_loop_of_fixed_length_has_the_values_of_the_advance(tilting, derivative,
 def test_gradient_of_a_run_is_that_of_finite_differences(
     tilting, derivative, forward, score_of, run, name
 ):
-    """Across new lists and a remap of the tilt; the radii decide in which steps grains meet, and
-    nothing else.
-    """
+    """Across new lists and a remap of the tilt; radii only decide in which steps grains meet."""
     at = parameters(*tilting)
     along = jnp.asarray(np.random.default_rng(1).normal(size=at[name].shape))
     step = 1e-8
     ends = []
     for sign in (1, -1):
         flow, start = changed(*tilting, at | {name: at[name] + sign * step * along})
-        flow = replace(
-            flow, **{number: float(getattr(flow, number)) for number in NAMES[:3]}
-        )  # compiled for such
         ends.append(score_of(run(flow, start, STEPS)[0]))
     high, low = ends
     numerical, exact = float((high - low) / (2 * step)), float(jnp.sum(derivative[1][name] * along))
@@ -330,9 +311,7 @@ def test_numbers_and_derivatives_are_nan_where_events_do_not_suffice(tilting, ba
 
 
 def collision(gap, scene, dt: float, moving_contacts: bool):
-    """Where the left of two equal discs, the other at rest, is a time after it hits: head on, at
-    rest in the shear.
-    """
+    """Where the left of two discs, the other at rest, is a time after it hits head on."""
     state = scene([[3.0, 0.0], [4.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]])
     flow = ShearFlow(GRAINS, 0.5, GRAINS * np.pi / 4 / 40**2, dt)
     state = replace(state, positions=state.positions.at[1, 0].add(gap))

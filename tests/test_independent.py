@@ -1,6 +1,4 @@
-"""Both engines against programs that share no code with them: from the same state, step by step and
-on average.
-"""
+"""Both engines against programs that share no code with them, step by step and on average."""
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +22,7 @@ STEPS, DT = 200, 1e-3
 
 
 class Plain:
-    """The time step of contact dynamics in its plainest form: all pairs, all images, dense
-    matrices.
-    """
+    """The time step in its plainest form: all pairs, all images, dense matrices."""
 
     def __init__(self, state: State, flow: jg.ShearFlow) -> None:
         self.x, self.c = np.array(state.positions), np.array(state.velocities)
@@ -40,9 +36,7 @@ class Plain:
         self.ahead, self.collisions = flow.activation * self.dt, 0
 
     def contacts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Grains i < j of each contact, unit normals from j to i, and relative normal
-        velocities.
-        """
+        """Grains i < j of each contact, normals from j to i, and relative normal velocities."""
         i, j = np.triu_indices(len(self.x), 1)
         s = nearest_image(self.x[i] - self.x[j], self.side, self.tilt)
         u = self.c[i] - self.c[j] + np.stack([self.rate * s[:, 1], np.zeros(len(s))], axis=1)
@@ -57,9 +51,7 @@ class Plain:
     def impulses(
         self, i: np.ndarray, j: np.ndarray, n: np.ndarray, approach: np.ndarray
     ) -> np.ndarray:
-        """Solution of 0 ≤ J ⟂ W J + (1 + α) u⁻ ≥ 0, which is that of the law u⁺ = u⁻ + W J, 0 ≤ J ⟂
-        u⁺ + α u⁻ ≥ 0.
-        """
+        """The solution of 0 ≤ J ⟂ W J + (1 + α) u⁻ ≥ 0: with u⁺ = u⁻ + W J, u⁺ + α u⁻ ≥ 0."""
         h, rows = np.zeros((len(i), len(self.x), 2)), np.arange(len(i))
         h[rows, i], h[rows, j] = n, -n
         solved = certified_impulses(
@@ -149,9 +141,7 @@ def test_fast_discs_do_not_pass_through_each_other(engine_run, gap, speed, activ
 def test_fast_coarse_sparse_flows_move_as_by_the_plainest_program(
     packed, engine_run, packing_fraction, timestep, speed, shear_rate, activation, steps, seed
 ) -> None:
-    """No contact is missed and no grains change sides without an impulse, or the status says that
-    lists are full.
-    """
+    """No contact is missed and no grain passes another, or the status says that lists are full."""
     velocities = speed * np.random.default_rng(seed).normal(size=(GRAINS, 2))
     still = packed(packing_fraction)
     state = State(still.grains, still.positions, jnp.asarray(velocities), still.side, still.tilt)
@@ -190,9 +180,7 @@ def test_contacts_of_a_step_are_those_of_the_plainest_program(flowing, packing_f
 def test_sums_over_200_steps_are_those_of_the_classical_loop(
     flowing, engine_run, packing_fraction, activation
 ) -> None:
-    """Lists, contacts, impulses and averages of two programs that were written apart, from the same
-    state.
-    """
+    """Two programs that were written apart, from the same state: contacts, impulses, averages."""
     state, flow = (
         flowing(packing_fraction),
         flow_of(packing_fraction, activation=activation, restitution=0.8),
@@ -243,9 +231,7 @@ def test_sums_over_200_steps_are_those_of_the_classical_loop(
 
 
 def simpson(begin: np.ndarray, end: np.ndarray) -> list[tuple[float, np.ndarray]]:
-    """Weights and values whose sum of squares is the mean over a flight, in which velocities are
-    linear in time.
-    """
+    """Weights and values whose sum of squares is the mean over a flight at linear velocities."""
     return [(1 / 6, begin), (4 / 6, (begin + end) / 2), (1 / 6, end)]
 
 

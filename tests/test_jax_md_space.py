@@ -1,6 +1,4 @@
-"""jax-md's functions on our states: pairs, structure and stresses are ours, and where its own space
-is wrong.
-"""
+"""jax-md's functions on our states: pairs, structure, stresses, and where its space is wrong."""
 
 from dataclasses import replace
 
@@ -69,9 +67,7 @@ def test_neighbour_lists_of_jax_md_have_our_pairs(tilt: float, state: State) -> 
 
 @pytest.mark.parametrize("tilt", TILTS)
 def test_stress_and_temperature_of_jax_md_are_ours(tilt: float, state: State) -> None:
-    """Of discs with the energy ½ (d − r)², the stress is −Σ f ⊗ r over the area, of pairs in the
-    sheared cell.
-    """
+    """Of discs with the energy ½ (d − r)², the stress is −Σ f ⊗ r over the area."""
     from jax_md import quantity, smap
 
     here = replace(state, tilt=jnp.asarray(tilt))
@@ -143,9 +139,7 @@ def test_batch_is_refused_and_vmap_applies(state: State) -> None:
 
 
 def test_simulator_from_parts_has_the_impulses_of_a_sample() -> None:
-    """Over the 40 steps of its page, to ten tolerances of the solver: later, flows of many
-    collisions diverge.
-    """
+    """Over the 40 steps of its page, to ten tolerances of the solver; later, flows diverge."""
     names: dict = {}
     exec("\n".join(python_of("how-to/jax-md.md")), names)
     tally, sums = names["samples"].tally, names["sums"]

@@ -75,9 +75,7 @@ def test_moments_come_close_to_event_driven_discs(
 
 @pytest.mark.parametrize("restitution", [0.3, 0.5, 0.9])
 def test_collisions_are_those_of_the_velocities_in_the_source(restitution):
-    """The mean relative speed of a Maxwellian with a Sonine term of weight a₂, by quadrature, to
-    first order in a₂.
-    """
+    """The mean relative speed of a Maxwellian with a Sonine term, to first order in a₂."""
     nodes, weights = np.polynomial.hermite.hermgauss(16)
     c = np.stack(np.meshgrid(*[nodes] * 4, indexing="ij"))
     weight = np.prod(np.meshgrid(*[weights] * 4, indexing="ij"), axis=0)
@@ -168,9 +166,7 @@ def test_enskogs_dissipation_vanishes_in_the_elastic_limit_as_one_minus_the_squa
 
 
 def test_collisional_transfer_of_slow_shear_has_the_viscosity_of_isotropic_collisions():
-    """Half of γ_b = (8/π) ν² χ (1 + α), in units of √(T/4π): V. Garzó and J. W. Dufty (1999) at
-    vanishing shear.
-    """
+    """Half of γ_b = (8/π) ν² χ (1 + α) in √(T/4π), V. Garzó and J. W. Dufty (1999)."""
     alpha, nu, rate, temperature = 0.8, 0.5, 1e-4, 2.0
     transfer = collisional_transfer(temperature * jnp.eye(2), alpha, nu, rate, 0.0)
     bulk = 8 / np.pi * nu**2 * float(contact_value(nu)) * (1 + alpha)
@@ -184,9 +180,7 @@ def test_collisional_transfer_of_slow_shear_has_the_viscosity_of_isotropic_colli
 
 
 def test_collision_integrals_equal_averages_over_sampled_collisions():
-    """Applies the rule of collision to random pairs, and compares with the closed forms within five
-    standard errors.
-    """
+    """Of random pairs that follow the rule of collision, within five standard errors."""
     alpha, nu, samples = 0.6, 0.5, 100_000
     mixture = jax.tree.map(np.asarray, uniform_mixture(jnp.asarray(nu), jnp.asarray(0.26), 2))
     xx, yy, xy = np.array([[0.5, 0.7], [0.3, 0.4], [-0.1, -0.15]])  # of the two classes
@@ -272,8 +266,6 @@ def test_one_elastic_replica_leaves_the_others_alone():
 
 
 def test_moments_that_newtons_method_does_not_find_are_not_finite() -> None:
-    """So close to one, rounding of the restitution leaves no root: steps stay above the
-    tolerance.
-    """
+    """So close to one, rounding leaves no root: steps stay above the tolerance."""
     assert np.isnan(numbers(moments(1 - 1e-12, 0.5))).all()
     assert np.isfinite(numbers(moments(1 - 1e-6, 0.5))).all()

@@ -18,9 +18,7 @@ LAW = (0.45, 0.1, 0.8, 0.82)  # s, b, m, ν_w
 
 
 def study(noise: float, seed: int = 0) -> list[dict]:
-    """Twenty flows whose averages approach 2 by one law, with noise of the stated relative
-    errors.
-    """
+    """Twenty flows whose averages approach 2 by one law, with noise of the stated errors."""
     rng, rows = np.random.default_rng(seed), []
     for alpha in (0.1, 0.3, 0.5, 0.7, 0.9):
         for nu in (0.2, 0.5, 0.7, 0.75):

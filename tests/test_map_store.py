@@ -35,9 +35,7 @@ def opened(output: Path, settings: MapSettings = SETTINGS, resume=True, overwrit
 
 
 def some() -> list[Replica]:
-    """Two seeds at each of the points (0.5, 0.5), (0.5, 0.9) and (0.6, 0.5), packing fraction and
-    restitution.
-    """
+    """Two seeds of packing fraction and restitution (0.5, 0.5), (0.5, 0.9) and (0.6, 0.5)."""
     rng = np.random.default_rng(0)
     return [
         random_replica(rng, SETTINGS, Status.not_steady if point == 1 else 0, point, seed)

@@ -1,6 +1,4 @@
-"""A sample is the strain asked for, in blocks that add up, alone or in a batch, and only where
-positions resolve it.
-"""
+"""A sample is the strain asked for, in blocks that add up, where positions resolve it."""
 
 import re
 from dataclasses import replace
@@ -192,9 +190,7 @@ def test_a_flow_that_is_not_that_of_the_state_is_refused(state) -> None:
 
 
 def test_a_sample_below_four_correlation_strains_says_so_however_it_is_taken(state) -> None:
-    """Alone, compiled, in a batch, as replicas of ``vmap`` and block by block; its strain compiles
-    nothing anew.
-    """
+    """Alone, compiled, in a batch, of ``vmap`` and block by block; nothing is compiled anew."""
     few = 0.32
     taken = [
         sample(FLOWS[0], state, few),
@@ -239,9 +235,7 @@ def test_a_force_ratio_without_a_cluster_has_the_error_of_those_it_may_have_miss
 
 
 def test_intervals_of_samples_shorter_than_their_correlation_hold() -> None:
-    """64 windows of less than two correlation strains, out of one flow. Their errors are not far
-    too large either.
-    """
+    """64 windows of less than two correlation strains; nor are their errors far too large."""
     flow = ShearFlow(64, 0.9, 0.5, 1e-3)
     state = prepare(flow, jax.random.key(5))
     _, measured = sample(flow, state, 480.0, blocks=7680)

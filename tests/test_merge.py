@@ -1,6 +1,4 @@
-"""Maps that are merged are those of one run to the bit, and what does not belong together is
-refused in a sentence.
-"""
+"""Merged maps are those of one run to the bit; what does not belong together is refused."""
 
 import shlex
 from dataclasses import replace
@@ -37,9 +35,7 @@ CLUSTER = Path(__file__).parents[1] / "docs" / "how-to" / "cluster.md"
 
 @pytest.fixture(scope="module")
 def replicas() -> dict[tuple[int, int], Replica]:
-    """The replicas of all points: one that is not steady, one that is infeasible, and one that is
-    not finite.
-    """
+    """Of all points: one that is not steady, one that is infeasible, one that is not finite."""
     bad = {(0, 1): Status.not_steady, (1, 0): Status.infeasible, (2, 2): Status.nonfinite}
     rng, made = np.random.default_rng(0), {}
     for point, seed in product(range(6), range(3)):

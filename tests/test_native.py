@@ -28,7 +28,7 @@ from hypothesis import strategies as st
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics import advance as advance_module
-from jaxgran.dynamics import step
+from jaxgran.dynamics import jax_engine, step
 from jaxgran.dynamics.engine import Jax, Numba, engine_named
 from jaxgran.dynamics.numba_engine import arrays, cluster_solver
 from jaxgran.dynamics.numba_engine.ffi import engine_folder
@@ -46,6 +46,13 @@ LOOK_AHEAD = 0.05  # strain, of the longest time step
 @pytest.fixture(scope="module")
 def native_run(engines):
     return engines["numba"]
+
+
+def state_of(positions, velocities, side, tilt=0.0, radii=0.5, masses=1.0) -> State:
+    """A state of any numbers; those of a grain are the same for all, or one for each."""
+    of_grains = (np.broadcast_to(x, len(positions)) for x in (radii, masses))
+    numbers = (jnp.asarray(x, float) for x in (positions, velocities, side, tilt))
+    return State(Grains(*(jnp.asarray(x, float) for x in of_grains)), *numbers)
 
 
 def assert_same(ours, plain, atol: float) -> None:
@@ -91,8 +98,7 @@ def test_flows_of_more_grains_are_those_of_the_plain_advance(run, native_run, ro
     radii, velocities = rng.uniform(0.45, 0.55, count), rng.normal(size=(count, 2))
     velocities -= np.average(velocities, axis=0, weights=radii**2)
     places = 1.11 * np.stack(np.divmod(np.arange(count), rows), axis=-1) + 0.1
-    arrays = places, velocities, 1.11 * rows, 0.4
-    state = State(Grains(*map(jnp.asarray, (radii, 4 * radii**2))), *map(jnp.asarray, arrays))
+    state = state_of(places, velocities, 1.11 * rows, 0.4, radii, 4 * radii**2)
     flow = of_state(ShearFlow(count, 0.5, 0.6, 5e-3), state)
     ours, plain = native_run(flow, state, steps), run(flow, state, steps)
     assert ours[1].status == Status.ok
@@ -136,13 +142,8 @@ def test_results_do_not_depend_on_the_order_of_the_grains(rows) -> None:
     rng, count = np.random.default_rng(rows), rows * rows
     radii = rng.uniform(0.37, 0.63, count)
     places = 1.5 * np.stack(np.divmod(np.arange(count), rows), axis=-1) + 0.1
-    state = State(
-        Grains(jnp.asarray(radii), jnp.asarray(4 * radii**2)),
-        jnp.asarray(places),
-        jnp.asarray(3 * rng.normal(size=(count, 2))),
-        jnp.asarray(1.5 * rows),
-        jnp.asarray(0.0),
-    )
+    velocities = 3 * rng.normal(size=(count, 2))
+    state = state_of(places, velocities, 1.5 * rows, radii=radii, masses=4 * radii**2)
     flow = of_state(ShearFlow(count, 0.9, 0.4, 1e-3), state)
     advance = jax.jit(partial(advance_module.advance, solver=EXACT))
     shuffled = rng.permutation(count)
@@ -156,14 +157,11 @@ def test_results_do_not_depend_on_the_order_of_the_grains(rows) -> None:
 
 
 def test_a_row_around_the_cell_comes_to_rest(native_run) -> None:
-    """Grains that touch in a closed row can only stand still relative to each other, whatever
-    drives them together.
-    """
+    """Grains in a closed row can only stand still, whatever drives them together."""
     places = np.stack([np.arange(GRAINS) + 0.5, np.full(GRAINS, GRAINS / 2)], axis=-1)
     velocities = np.zeros((GRAINS, 2))
     velocities[:, 0] = -0.1 * np.sin(2 * np.pi * np.arange(GRAINS) / GRAINS)
-    grains = Grains(jnp.asarray(np.full(GRAINS, 0.5 * (1 + 1e-3))), jnp.ones(GRAINS))
-    state = State(grains, *(jnp.asarray(x, float) for x in (places, velocities, GRAINS, 0.0)))
+    state = state_of(places, velocities, GRAINS, radii=0.5 * (1 + 1e-3))
     after, tally = native_run(
         flow_of(0.7, restitution=0.0, shear_rate=0.0), state, 1, BarzilaiBorwein(1e-6)
     )
@@ -173,16 +171,13 @@ def test_a_row_around_the_cell_comes_to_rest(native_run) -> None:
 
 @pytest.mark.parametrize("heaviest", [1.0, 1e4])
 def test_stiff_clusters_are_solved_as_by_the_plain_advance(run, native_run, heaviest) -> None:
-    """One grain runs into a long row of touching ones, light and heavy in turn: sweeps alone would
-    take thousands.
-    """
+    """A grain hits a long row, light and heavy in turn: sweeps alone would take thousands."""
     gap = 1e-9
     places = np.stack([2 + np.arange(GRAINS) * (1 - gap), np.full(GRAINS, 30.0)], axis=-1)
     velocities = np.zeros((GRAINS, 2))
     velocities[0, 0] = 1.0
     masses = np.where(np.arange(GRAINS) % 2, heaviest, 1.0)
-    grains = Grains(jnp.asarray(np.full(GRAINS, 0.5)), jnp.asarray(masses))
-    state = State(grains, *(jnp.asarray(x, float) for x in (places, velocities, 60.0, 0.0)))
+    state = state_of(places, velocities, 60.0, masses=masses)
     flow, solver = flow_of(0.01, restitution=0.0, shear_rate=0.0), BarzilaiBorwein(1e-9, 10**6)
     ours, plain = native_run(flow, state, 1, solver), run(flow, state, 1, solver=solver)
     assert ours[1].status == plain[1].status == Status.ok
@@ -198,13 +193,14 @@ def test_copies_of_a_cluster_are_solved_as_one_within_the_tolerance(native_run, 
     """
     column, row = np.arange(GRAINS) % 8, np.arange(GRAINS) // 8
     places = np.stack([2 + column * (1 - 1e-9), 5.0 * row + 2], axis=-1)
-    grains = Grains(jnp.asarray(np.full(GRAINS, 0.5)), jnp.ones(GRAINS))
     tallies = []
     for copies in (1, 2, 4):
         velocities = np.zeros((GRAINS, 2))
         velocities[(column == 0) & (row < copies), 0] = 1.0
-        state = State(grains, *(jnp.asarray(x, float) for x in (places, velocities, 40.0, 0.0)))
-        flow = flow_of(0.01, restitution=0.0, shear_rate=0.0)
+        state, flow = (
+            state_of(places, velocities, 40.0),
+            flow_of(0.01, restitution=0.0, shear_rate=0.0),
+        )
         tallies.append(native_run(flow, state, 1, BarzilaiBorwein(tolerance))[1])
     assert tallies[0].iterations == tallies[1].iterations == tallies[2].iterations > 5
     assert all(0 < tally.worst_residual <= tolerance for tally in tallies)
@@ -220,42 +216,33 @@ def test_grains_that_a_collision_made_faster_meet_whatever_their_distance(native
     flow = flow_of(0.02, restitution=1.0, shear_rate=0.0, timestep=1.44)
     for gap in np.linspace(8.0, 8.64, 33)[:-1]:
         places[:, :6] = [[5, 6, 7 + gap, 8 + gap, 5, 6.72], [5, 5, 5, 5, 15, 15]]
-        arrays = places.T, velocities, 40.0, 0.0
-        grains = Grains(jnp.asarray(np.full(GRAINS, 0.5)), jnp.asarray(masses))
-        after, _ = native_run(flow, State(grains, *map(jnp.asarray, arrays)), 2)
+        after, _ = native_run(flow, state_of(places.T, velocities, 40.0, masses=masses), 2)
         np.testing.assert_allclose(after.velocities[[1, 2], 0], [-2, 2], atol=1e-3, err_msg=gap)
 
 
 def test_steps_that_outrun_a_usual_skin_have_lists_as_wide_as_they_need(native_run) -> None:
     row, rng = 6, np.random.default_rng(1)
     places = 1.05 * np.stack(np.divmod(np.arange(GRAINS), row), axis=-1) + 0.5
-    grains = Grains(jnp.asarray(np.full(GRAINS, 0.5)), jnp.ones(GRAINS))
-    state = State(
-        grains,
-        *(jnp.asarray(x, float) for x in (places, rng.normal(size=places.shape), 1.05 * row, 0.0)),
-    )
-    _, tally = native_run(ShearFlow(GRAINS, 0.5, 0.7, 0.05), state, 3, BarzilaiBorwein())
+    state = state_of(places, rng.normal(size=places.shape), 1.05 * row)
+    _, tally = native_run(flow_of(0.7, timestep=0.05), state, 3, BarzilaiBorwein())
     assert tally.status == Status.ok and tally.deep_contacts > tally.contacts / 10
 
 
 def test_a_solve_of_nothing_has_no_residual(native_run) -> None:
-    """Two grains that graze each other approach by rounding only, and without shear the residual
-    has no floor.
-    """
-    places, speeds = (
-        5.0 * np.stack(np.divmod(np.arange(GRAINS), 6), axis=-1) + 1,
-        np.zeros((GRAINS, 2)),
-    )
-    grains = Grains(jnp.asarray(np.full(GRAINS, 0.5)), jnp.ones(GRAINS))
+    """Two grains graze each other by rounding only; without shear the residual has no floor."""
+    places = 5.0 * np.stack(np.divmod(np.arange(GRAINS), 6), axis=-1) + 1
+    speeds = np.zeros((GRAINS, 2))
     for angle in np.linspace(0.1, 3.0, 60):
         normal = np.array([np.cos(angle), np.sin(angle)])
         places[1], speeds[0] = places[0] + (1 - 1e-9) * normal, normal[::-1] * [-1, 1]
-        state = State(grains, *(jnp.asarray(x, float) for x in (places, speeds, 40.0, 0.0)))
-        _, tally = native_run(flow_of(0.03, shear_rate=0.0), state, 2)
+        _, tally = native_run(flow_of(0.03, shear_rate=0.0), state_of(places, speeds, 40.0), 2)
         assert np.isfinite(tally.worst_residual)
 
 
-def test_derivatives_and_the_values_beside_them_are_those_of_the_engine_jax(flowing) -> None:
+def test_derivatives_and_the_values_beside_them_are_those_of_the_engine_jax(
+    flowing, monkeypatch
+) -> None:
+    monkeypatch.setattr(jax_engine, "contact_buffers", lambda _: ())  # there is less to compile
     state = flowing(0.6)
 
     def velocities(alpha, engine):
@@ -289,23 +276,14 @@ def test_derivatives_and_the_values_beside_them_are_those_of_the_engine_jax(flow
 def test_senseless_states_come_to_an_end(
     native_run, place, speed, radius, mass, side, tilt, shear_rate
 ) -> None:
-    """Whatever a state holds, the loop ends, and what cannot be is flagged; here that nothing is
-    NaN and called ok.
-    """
+    """Whatever a state holds, the loop ends, and nothing is NaN and called ok."""
     rng = np.random.default_rng(0)
-    arrays = (
-        place * rng.uniform(-1, 1, (GRAINS, 2)),
-        speed * rng.uniform(-1, 1, (GRAINS, 2)),
-        side,
-        tilt,
+    places, velocities = (x * rng.uniform(-1, 1, (GRAINS, 2)) for x in (place, speed))
+    state, flow = (
+        state_of(places, velocities, side, tilt, radius, mass),
+        flow_of(shear_rate=shear_rate),
     )
-    state = State(
-        Grains(jnp.asarray(np.full(GRAINS, radius)), jnp.asarray(np.full(GRAINS, mass))),
-        *(jnp.asarray(x, float) for x in arrays),
-    )
-    after, tally = native_run(
-        flow_of(0.6, shear_rate=shear_rate), state, 20, BarzilaiBorwein(1e-12, 100)
-    )
+    after, tally = native_run(flow, state, 20, BarzilaiBorwein(1e-12, 100))
     if not np.all(np.isfinite(after.velocities)):
         assert tally.status == Status.nonfinite
 
@@ -356,9 +334,7 @@ def test_a_traced_number_that_cannot_be_ends_its_replica_and_no_other(engine) ->
 def test_no_pair_closes_by_more_than_its_list_loses_of_the_skin(
     fastest, distance, angles, strain, shear_rate
 ) -> None:
-    """Both grains fly straight in the laboratory, with the largest peculiar speed in any
-    directions.
-    """
+    """Both fly straight in the laboratory, at the largest peculiar speed in any directions."""
     apart = distance * np.array([np.cos(angles[0]), np.sin(angles[0])])
     (ci, si), (cj, sj) = ((np.cos(a), np.sin(a)) for a in angles[1:])
     velocity = fastest * np.array([ci - cj, si - sj]) + [shear_rate * apart[1], 0]
@@ -394,9 +370,7 @@ def test_bound_of_closing_includes_that_speeds_grow_within_a_flight(engine, spee
 
 @pytest.fixture(scope="module")
 def near_pairs_found():
-    """``find_near_pairs`` with a way in from Python; kept from run to run, as long as the numba
-    engine is the same.
-    """
+    """``find_near_pairs`` with a way in from Python; kept as long as the engine is the same."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(numba.config, "CACHE_DIR", str(engine_folder()))
         return numba.njit(cache=True)(find_near_pairs.py_func)

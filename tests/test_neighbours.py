@@ -1,6 +1,4 @@
-"""The cell-list search finds the pairs that a search of all images finds, or says that it may have
-missed some.
-"""
+"""The cell-list search finds the pairs of all images, or says that it may have missed some."""
 
 import jax
 import numpy as np
@@ -40,9 +38,7 @@ def batched_search(positions, side, tilt, cutoff):
 
 
 def flow_cell(count, packing_fraction, polydispersity=0.26):
-    """Side of the cell, and the cutoff at which a homogeneous flow fills 0.8 of the engine's
-    buffer.
-    """
+    """Side of the cell, and the cutoff at which a flow fills 0.8 of the engine's buffer."""
     side = np.sqrt(np.pi / 4 * count * (1 + polydispersity**2 / 3) / packing_fraction)
     return side, side * np.sqrt(1.6 * PAIRS_PER_GRAIN / (np.pi * count)) + polydispersity
 

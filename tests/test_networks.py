@@ -1,6 +1,4 @@
-"""Laws of the projected methods on contact networks that are hard in one respect, and on those of a
-dense flow.
-"""
+"""Laws of the methods on networks that are hard in one respect, and of a dense flow."""
 
 from functools import partial
 
@@ -98,9 +96,7 @@ def test_what_is_jammed_is_infeasible(solution_of) -> None:
 def test_jacobi_with_the_spectral_bound_lowers_the_objective_in_every_step(
     feasible, solution_of
 ) -> None:
-    """The iteration J ← max(0, J − ω D⁻¹(W J + b)) for ω close to 2, dense; compiled, capped solves
-    follow it.
-    """
+    """J ← max(0, J − ω D⁻¹(W J + b)) for ω close to 2, dense; capped solves follow it."""
     for number, network in enumerate(feasible):
         used = np.asarray(network.contacts.used)
         matrix = delassus(*network)[np.ix_(used, used)]

@@ -92,9 +92,7 @@ def test_the_variable_of_numba_sets_the_number_of_threads(
 
 @pytest.mark.skipif(sys.platform != "linux", reason="no list of the threads of a process")
 def test_no_thread_outlives_a_call_that_lacks_memory(tmp_path: Path) -> None:
-    """Memory for one replica of six: none of the threads that have none may end the call before
-    the others end.
-    """
+    """With memory for one replica of six, no thread without any ends the call before others."""
     script = """
 import os, resource
 import jax, numpy as np

@@ -1,6 +1,4 @@
-"""The numba engine: a cache for each version of its sources, and blocks of steps that are those of
-one call each.
-"""
+"""The numba engine: a cache for each version of its sources, and blocks as one call each."""
 
 import os
 import re
@@ -126,9 +124,7 @@ def test_processes_that_compile_and_one_that_loads_have_the_same_bits(tmp_path: 
 
 
 def words(structure: str) -> dict[str, int]:
-    """Offset of each field of a structure of XLA's C interface in words, as the header of this
-    jaxlib has it.
-    """
+    """Offsets in words of the fields of a structure of XLA's C interface, by its header."""
     header = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text(
         encoding="utf-8"
     )
@@ -171,9 +167,7 @@ def test_a_jaxlib_that_refuses_the_version_of_the_handler_is_an_input_error(monk
 
 @pytest.mark.parametrize("packing_fraction", [0.6, 0.8])
 def test_blocks_of_one_call_are_those_of_one_call_each(flowing, packing_fraction: float) -> None:
-    """Up to rounding, as the list of near pairs lasts longer than a block; one block has no
-    step.
-    """
+    """Up to rounding, as a list of near pairs outlasts a block; one block has no step."""
     flow, state = ShearFlow(GRAINS, 0.6, packing_fraction, 1e-3), flowing(packing_fraction)
     steps = jnp.asarray([20, 0, 1, 7, 30, 12])
     end, tallies = advance(flow, state, steps, engine=Numba())

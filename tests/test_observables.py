@@ -13,9 +13,7 @@ GRAINS, AREA, SHEAR_RATE, TIMESTEP = 20, 31.0, 2.0, 1e-2
 
 @pytest.fixture(scope="module")
 def microscopic() -> dict[str, list[np.ndarray]]:
-    """Contacts of a few time steps, a list of arrays over the contacts of each, and the velocities
-    of each.
-    """
+    """Arrays over the contacts of each of a few time steps, and the velocities of each."""
     rng = np.random.default_rng(0)
     counts = [7, 0, 5, 9, 0, 0, 3]
     return {

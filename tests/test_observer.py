@@ -1,6 +1,4 @@
-"""Observables of one's own: every time step counts once, forces exactly, and looking changes
-nothing.
-"""
+"""Observables of one's own: each step counts once, forces exactly; looking changes nothing."""
 
 from dataclasses import replace
 from functools import partial
@@ -70,9 +68,7 @@ def test_every_step_counts_once_in_every_block(observed) -> None:
 
 
 def test_forces_are_averaged_exactly(observed, plain_sample) -> None:
-    """The stress of the contacts, their number and their errors are the engine's own, to
-    rounding.
-    """
+    """Stress and number of contacts and their errors are the engine's, to rounding."""
     means, errors = observed[1].observed()
     np.testing.assert_allclose(means["stress"], plain_sample[1].contact_stress, rtol=1e-12)
     np.testing.assert_allclose(
@@ -116,9 +112,7 @@ def test_error_of_a_ratio_is_that_of_the_ratio(observed) -> None:
 
 
 def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monkeypatch) -> None:
-    """With room for three, a call of the numba engine ends after every other step with contacts,
-    and none is taken twice.
-    """
+    """With room for three, a call ends after every other step with contacts; none counts twice."""
     monkeypatch.setattr(records, "_MOST_ROOM", 3)
     steps = jnp.int32(320)
     end, tally = jax.jit(lambda state: advance(FLOW, state, steps, observe))(flowing(0.7))

@@ -1,6 +1,4 @@
-"""Nothing that took time is replaced by something else: it is refused in a sentence, until
---overwrite is given.
-"""
+"""Nothing that took time is replaced: it is refused in a sentence, until --overwrite."""
 
 import os
 from pathlib import Path

@@ -1,6 +1,4 @@
-"""Any sizes and masses: packed without overlap, no contact missed, heated as theory says; masses
-are but a unit.
-"""
+"""Any sizes and masses: packed without overlap, no contact missed, heated as theory says."""
 
 import re
 from dataclasses import replace
@@ -43,9 +41,7 @@ def flow_of(packing_fraction: float = 0.7, **change) -> ShearFlow:
 
 @pytest.fixture(scope="module")
 def packed_own():
-    """``packed_own(law, packing_fraction)``: a packing at rest; ``packed_own.compiled`` is
-    ``pack``.
-    """
+    """``packed_own(law, packing_fraction)``: a packing at rest, by ``packed_own.compiled``."""
     compiled = jax.jit(pack)
 
     @cache
@@ -146,9 +142,7 @@ def test_start_and_prepare_keep_the_grains_and_heat_them_alike():
 
 
 def test_theory_of_given_grains_is_that_of_their_law():
-    """Eight classes of uniform diameters stand for the law as its quadrature does; masses are a
-    unit.
-    """
+    """Eight classes of diameters stand for the law as its quadrature does; masses are a unit."""
     grains = polydisperse(256, 0.26, jax.random.key(0))
     diameters, masses, fractions = size_classes(grains)
     given = mixture_moments(0.8, 0.6, 1.0, diameters, masses, fractions)

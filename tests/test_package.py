@@ -50,9 +50,7 @@ def test_public_names_resolve_and_are_documented() -> None:
 
 
 def test_editors_know_the_names_without_running_them(tmp_path: Path) -> None:
-    """Types of public names, of the averages of a sample and of a snapshot in a series, by the stub
-    alone.
-    """
+    """Types of public names, of averages and of a snapshot in a series, by the stub alone."""
     code = """
 import jaxgran as jg
 def typed(flow: jg.ShearFlow, sample: jg.Sample, series: jg.Snapshot) -> None:

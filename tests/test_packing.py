@@ -18,9 +18,7 @@ def test_packing_has_no_overlap_and_the_packing_fraction(packed, packing_fractio
 
 @pytest.mark.parametrize("packing_fraction", [0.2, 0.6])
 def test_no_packing_of_many_has_an_overlap(packed, packing_fraction):
-    """Inertia of the relaxation must not carry the grains past the place where their overlap was
-    measured.
-    """
+    """Inertia must not carry grains past the place where their overlap was measured."""
     for seed in range(30):
         state = packed(packing_fraction, seed)
         assert (

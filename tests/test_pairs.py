@@ -1,6 +1,4 @@
-"""Neighbour lists against brute force: complete while they are valid, also after large shear; never
-silently short.
-"""
+"""Neighbour lists against brute force: complete while valid, never silently short."""
 
 from dataclasses import replace
 
@@ -39,9 +37,7 @@ def both_separations(hood: PairLists, side):
 def test_valid_list_holds_every_touching_pair_under_motion_and_shear(
     packed, packing_fraction, motion, shear
 ):
-    """Random motion of every grain and shear over several remaps of the tilt, with the pairs of
-    brute force.
-    """
+    """Random motion and shear over several remaps of the tilt, with the pairs of brute force."""
     state, rng = packed(packing_fraction), np.random.default_rng(5)
     side, radii = float(state.side), np.asarray(state.grains.radii)
     hood = build(state.positions, state.grains, state.side, state.tilt)
@@ -102,9 +98,7 @@ def clustered(count: int, side: float, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("buffer", ["NEAR_PAIRS_PER_GRAIN", "OUTER_PAIRS_PER_GRAIN"])
 def test_pairs_left_out_are_flagged(packed, monkeypatch, buffer):
-    """With a buffer that is too small a list is complete, or says that it is not: by its flag or a
-    skin used up.
-    """
+    """A list is complete, or says that it is not: by its flag or a skin used up."""
     state, flags = packed(0.7), []
     monkeypatch.setattr(near_pairs, buffer, 2)
     tiny = jax.jit(lambda *arguments: pair_lists(*arguments))
@@ -158,9 +152,7 @@ def test_motion_in_a_sheared_frame_consumes_the_skin_by_which_it_closes_gaps(str
 
 
 def test_near_list_filtered_after_large_shear_holds_every_pair_within_its_skin():
-    """In dilute flow the skin is wider than a grain: shear then brings in pairs from farther than
-    touching ones.
-    """
+    """In dilute flow the skin is wider than a grain: shear brings in pairs from farther away."""
     rng, count = np.random.default_rng(0), 256
     grains = Grains(jnp.full(count, 0.5), jnp.ones(count))
     side = jnp.sqrt(count * jnp.pi / 4 / 0.1)

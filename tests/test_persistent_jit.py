@@ -1,6 +1,4 @@
-"""Compiled programs that are kept on disk: found without tracing, compiled again if anything they
-depend on changes.
-"""
+"""Programs on disk: found without tracing, compiled again if what they depend on changes."""
 
 from pathlib import Path
 from threading import Thread

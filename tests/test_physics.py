@@ -1,6 +1,4 @@
-"""Laws that cross modules: rebound, energy, momentum, power balance, Bagnold's scaling,
-simultaneous impacts.
-"""
+"""Laws that cross modules: rebound, energy, momentum, power, Bagnold's scaling."""
 
 from dataclasses import replace
 
@@ -48,9 +46,7 @@ def energy(state: State) -> float:
 
 @pytest.mark.parametrize("restitution", [0.0, 0.6, 1.0])
 def test_two_discs_rebound_with_the_coefficient_of_restitution(engine_run, scene, restitution):
-    """At random phases of the step, speeds, angles, sizes and offsets; the normal is that of the
-    change itself.
-    """
+    """At random phases, speeds, angles, sizes and offsets; the normal is that of the change."""
     rng = np.random.default_rng(int(10 * restitution))
     for _ in range(COLLISIONS):
         radii, angle, offset = (
@@ -115,9 +111,7 @@ POINTS = [(0.75, 1e-2), (0.6, 1e-3)]
 def test_no_step_gains_energy_and_elastic_steps_keep_it(
     engine_run, flowing, packing_fraction, timestep, restitution
 ):
-    """In the frame of the contacts: the fall of the peculiar energy and the work of the shear on
-    the impulses.
-    """
+    """In the frame of the contacts: the fall of energy and the work of the shear on impulses."""
     state, flow = (
         flowing(packing_fraction),
         flow_of(packing_fraction, restitution=restitution, timestep=timestep),
@@ -161,9 +155,7 @@ def test_impulses_are_proportional_to_one_plus_restitution(engine_run, flowing, 
 
 @pytest.mark.parametrize("drift", [(0.0, 0.0), (0.3, 0.7)])
 def test_momentum_is_conserved(engine_run, flowing, drift):
-    """m c_y stays, and m c_x falls by γ̇ m c_y t: a drift across the shear changes nothing in the
-    laboratory.
-    """
+    """m c_y stays, m c_x falls by γ̇ m c_y t: a drift across changes nothing in the laboratory."""
     state = flowing(0.75)
     state = replace(state, velocities=state.velocities + jnp.asarray([drift]))
     flow, steps = flow_of(0.75), 400
@@ -209,9 +201,7 @@ def test_flow_without_shear_keeps_its_momentum_and_loses_what_it_dissipates(
 def test_energy_balance_tests_the_books_and_the_complementarity_power_the_solver(
     engine, engine_run, flowing
 ):
-    """The balance closes however badly a network is solved; the power that impulses waste falls
-    with the tolerance.
-    """
+    """The balance closes however badly a network is solved; what impulses waste falls."""
     flow, state = flow_of(0.75, restitution=0.1), flowing(0.75)
     wasted = []
     for tolerance, cap in ((1e-12, 1), (1e-2, 5000), (1e-4, 5000), (1e-8, 5000)):
@@ -226,9 +216,7 @@ def test_energy_balance_tests_the_books_and_the_complementarity_power_the_solver
 
 @pytest.mark.parametrize("packing_fraction", [0.2, 0.75])
 def test_no_contact_is_missed_over_large_shear(engine_run, flowing, packing_fraction):
-    """Overlaps by brute force stay within those that were met as contacts and one step of the
-    fastest pair.
-    """
+    """Overlaps by brute force are at most those of contacts and a step of the fastest pair."""
     state, flow, tilts = flowing(packing_fraction), flow_of(packing_fraction, restitution=0.7), []
     for _ in range(BLOCKS):
         state, tally = engine_run(flow, state, 60, BarzilaiBorwein())
@@ -253,9 +241,7 @@ def test_moments_are_symmetric_and_the_stresses_compress(engine_run, flowing):
 def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit(
     engine_run, flowing, packing_fraction
 ):
-    """Bagnold's scaling: rigid grains have no time scale but that of the shear, so stresses go with
-    its square.
-    """
+    """Bagnold: rigid grains have no time scale but the shear's, so stresses go with its square."""
     steps = 500
     state, flow, solver = (
         flowing(packing_fraction),

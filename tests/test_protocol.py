@@ -1,6 +1,4 @@
-"""A flow starts as theory says, is sheared until it is steady by a stated criterion, and its time
-step is shortened.
-"""
+"""A flow starts as theory says, is sheared until steady, and its time step is shortened."""
 
 import re
 from dataclasses import replace
@@ -245,9 +243,7 @@ def test_a_replica_that_is_given_up_is_not_advanced_and_changes_no_other(batch) 
 def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(
     batch, monkeypatch
 ) -> None:
-    """Both replicas start with a strain of 0.64, in 32 blocks of two steps; the limit is four times
-    that.
-    """
+    """Both start with a strain of 0.64, in 32 blocks of two steps; the limit is four times that."""
     monkeypatch.setattr(extension, "LONGEST_STRAIN", 2.56)
     monkeypatch.setattr(extension, "LONGEST_CORRELATION_STRAINS", 0)
     _, short = sample_batch(batch, 0.64)

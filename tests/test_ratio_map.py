@@ -139,9 +139,7 @@ def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> No
 def test_a_replica_that_came_to_nothing_keeps_its_status_and_is_in_no_average(
     settings, bad, monkeypatch
 ) -> None:
-    """Of another time step its force ratio would be another, so it is not run again with a shorter
-    one.
-    """
+    """With another time step its force ratio would be another, so it is not run again."""
     rng, calls, keys = np.random.default_rng(0), [], [(0, 0), (0, 1), (1, 0), (1, 1)]
 
     def measured(_, batch, *__):
@@ -334,9 +332,7 @@ def test_first_of_several_time_steps_has_the_numbers_of_a_map_at_it_alone(
 def test_first_of_several_numbers_of_grains_has_the_numbers_of_a_map_at_it_alone(
     settings, results
 ) -> None:
-    """The larger one has an area that is larger in proportion, and both stand at their place in the
-    dataset.
-    """
+    """The larger one has a larger area, and both stand at their place in the dataset."""
     several = {**SETTINGS, "grains": [32, 64], "seeds": 1}
     data = ratio_map(**several)
     assert data.force_ratio.dims == ("grains", "packing_fraction", "restitution")

@@ -1,6 +1,4 @@
-"""A batch of flows has the results of its replicas: called directly, under ``jax.vmap``, and one by
-one.
-"""
+"""A batch of flows has the results of its replicas: directly, under ``vmap``, one by one."""
 
 import re
 from dataclasses import replace
@@ -53,9 +51,7 @@ def test_numbers_that_are_the_same_for_all_replicas_are_broadcast() -> None:
 
 
 def test_batch_is_sampled_as_under_vmap_and_as_one_by_one(states: State) -> None:
-    """To the bit, but for the energy of waves under ``vmap``: vectors of cosines are rounded by
-    their length.
-    """
+    """To the bit, but for waves under ``vmap``: cosines of vectors are rounded by their length."""
     together = sample(FLOWS, states, 0.3)
     vmapped = jax.vmap(sample, (0, 0, None))(FLOWS, states, 0.3)
     assert_same(together, vmapped, but="wave_kinetic")

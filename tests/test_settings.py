@@ -1,6 +1,4 @@
-"""Every mistake in the parameters of a map is one sentence that names the accepted range, before
-anything runs.
-"""
+"""Mistakes in the parameters of a map are sentences that name the range, before it runs."""
 
 from dataclasses import replace
 from itertools import product
@@ -113,9 +111,7 @@ def test_a_given_tolerance_is_that_of_the_solver() -> None:
 
 
 def test_the_command_and_the_function_start_alike() -> None:
-    """What is left to Python has no text form, and what is left to the command is about figures and
-    the terminal.
-    """
+    """Python alone has what has no text form, the command what is of figures and terminal."""
     python_only = {"observe", "grains_by_point", "progress", "record", "attributes"}
     assert set(MAP_OPTIONS) - {"format", "json", "quiet"} == set(OPTIONS) - python_only
     assert with_start(None, None, {}) == PRESETS["quick"]

@@ -1,6 +1,4 @@
-"""The sizes of the grains of a map: measured with the discs that are given, kept in the file, and
-repeated from it.
-"""
+"""The sizes of the grains of a map: measured, kept in the file, and repeated from it."""
 
 from typing import Any
 

@@ -1,6 +1,4 @@
-"""Snapshots are the flow itself: their forces are those of the next step, and taking them changes
-nothing.
-"""
+"""Snapshots are the flow: their forces are those of the next step, and change nothing."""
 
 from dataclasses import replace
 
@@ -62,9 +60,7 @@ def test_taking_snapshots_changes_nothing(flow, flowing, run, series) -> None:
 
 
 def test_sums_over_the_snapshots_of_every_step_are_those_of_the_tally(flow, flowing, run) -> None:
-    """The stress of all contacts, and of those in clusters, which the tally finds without walking
-    through any.
-    """
+    """Of all contacts, and of those in clusters, which the tally finds without a walk."""
     state, steps = flowing(0.78), 40
     _, tally = run(flow, state, steps)
     one_snapshot, contact, clustered = jax.jit(snapshot), np.zeros((2, 2)), np.zeros((2, 2))

@@ -1,6 +1,4 @@
-"""One call for any contact problem: against independent solvers, by the contact law, and as JAX
-transforms it.
-"""
+"""Any contact problem: against independent solvers, by the law, and as JAX transforms it."""
 
 from dataclasses import replace
 from functools import partial
@@ -260,9 +258,7 @@ def weighted(weights, problem, restitution):
 
 
 def assert_derivatives(function, at, along, step=1e-6):
-    """The slope along a direction, in forward and in reverse mode, is that of a central
-    difference.
-    """
+    """The slope along a direction, in both modes, is that of a central difference."""
     function = jax.jit(function)
     up, down = (
         function(jax.tree.map(lambda x, d, s=s: x + s * d, at, along)) for s in (step, -step)

@@ -1,6 +1,4 @@
-"""Contact solves: against dense matrices and exact solutions, and what happens where there is no
-solution.
-"""
+"""Contact solves: against dense matrices and exact solutions, and where there is none."""
 
 from dataclasses import replace
 
@@ -145,9 +143,7 @@ def test_cap_of_iterations_returns_the_best_iterate(solved, method):
 
 
 def squeezed(grains: int) -> Contacts:
-    """A row of grains closed through the periodic boundary, all of whose contacts approach: no
-    impulses stop them.
-    """
+    """A row closed through the boundary, all of whose contacts approach: nothing stops them."""
     i = np.arange(grains)
     return padded_network(
         i,

@@ -18,9 +18,7 @@ from jaxgran.model.status import DEEP_OVERLAP, Status
 
 @pytest.mark.parametrize("packing_fraction", [0.82, stability.JAMMED])
 def test_dense_flow_converges_or_is_flagged(packing_fraction: float) -> None:
-    """Below jamming at 0.8386 it is ok. Above, what is called ok is solved, hardly overlaps and is
-    finite, and no energy appears.
-    """
+    """Below jamming at 0.8386 it is ok; above, what is called ok is solved and gains no energy."""
     case = stability.Case(0.0, packing_fraction, 64)
     solver = jg.BarzilaiBorwein()
     state = stability.start(case, seed=0)

@@ -1,6 +1,4 @@
-"""The last states of a map are those of its flows, cost its numbers nothing, and survive every
-file.
-"""
+"""The last states of a map are those of its flows, cost no numbers, and survive files."""
 
 from dataclasses import replace
 from itertools import product
@@ -73,9 +71,7 @@ FILE = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0, snaps
 
 
 def made_up() -> dict[ReplicaId, Replica]:
-    """Made-up replicas of a map; one point has no state, and they have different numbers of
-    grains.
-    """
+    """Made-up replicas of different numbers of grains; one point has no state."""
     rng, made = np.random.default_rng(0), {}
     states = {(point, 0): random_state(point, 20 + point) for point in (0, 1, 3)}
     for key in product(range(4), (0, 1)):

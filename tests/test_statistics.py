@@ -35,9 +35,7 @@ def ar1(rng: np.random.Generator, shape: tuple[int, int], correlation: float) ->
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.6, 0.8])
 def test_correlation_length_is_that_of_the_process(correlation: float) -> None:
-    """An AR(1) series of n values is worth n (1 − φ)/(1 + φ) samples. Long series: a short one
-    shows less.
-    """
+    """n values of AR(1) are worth n (1 − φ)/(1 + φ) samples; a short series shows less."""
     rng, lengths = np.random.default_rng(6), []
     for _ in range(60):
         sums = {"over": ar1(rng, (4, 256), correlation), "under": np.ones((4, 256))}
@@ -78,9 +76,7 @@ def error_of_mean(series: np.ndarray) -> np.ndarray:
 def test_intervals_hold_if_a_seed_is_sixteen_times_as_long_as_its_memory(
     memory: float, seeds: int
 ) -> None:
-    """95 % intervals of 32 blocks hold in 92 to 98 % of the trials, and are at most 1.3 times as
-    wide as the true.
-    """
+    """95 % intervals of 32 blocks hold in 92 to 98 % of the trials, and are not too wide."""
     correlation, trials = np.exp(-1 / memory), 1000
     rng = np.random.default_rng(9)
     series = np.stack([ar1(rng, (trials, 32), correlation).T for _ in range(seeds)])
@@ -96,9 +92,7 @@ def test_intervals_hold_if_a_seed_is_sixteen_times_as_long_as_its_memory(
 def test_intervals_of_seeds_of_unequal_length_are_those_of_one_correlation_time(
     memory: float,
 ) -> None:
-    """Sixteen short seeds, whose blocks are correlated, and one of eight times the length, whose
-    blocks are not.
-    """
+    """Sixteen short seeds with correlated blocks, and one eight times as long without."""
     rng, lengths, found = np.random.default_rng(0), [1] * 16 + [8], []
     for _ in range(TRIALS):
         series = [ar1(rng, (1, 32 * length), np.exp(-1 / memory)) for length in lengths]
@@ -112,9 +106,7 @@ def test_intervals_of_seeds_of_unequal_length_are_those_of_one_correlation_time(
 
 
 def test_interval_is_that_of_the_posterior_integrated_by_brute_force() -> None:
-    """The likelihood of eight Gaussian values, summed over the mean, ln σ, the memory and the white
-    share.
-    """
+    """The likelihood of eight values, summed over mean, ln σ, memory and white share."""
     x = ar1(np.random.default_rng(10), (2, 4), 0.5) + 3.0
     lag = np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
     half = 1.959964 * error_of_mean(x)
@@ -173,9 +165,7 @@ def test_standard_error_of_a_ratio_of_sums_is_the_spread_of_many_samples() -> No
 
 
 def test_blocks_that_differ_by_a_step_have_the_error_of_all_their_steps() -> None:
-    """White noise of each step, in blocks of five and six steps, as those of a strain that 32
-    blocks do not divide.
-    """
+    """White noise of each step, in blocks of five and six, as of a strain that 32 do not divide."""
     rng, steps = np.random.default_rng(12), steps_of_blocks(np.array(176.0), 32)
     assert set(steps.tolist()) == {5, 6}
     noise = np.sqrt(steps)[:, None] * rng.normal(size=(2, 32, TRIALS))
@@ -200,9 +190,7 @@ def test_error_of_equal_blocks_is_zero_and_of_an_unknown_value_unknown() -> None
 
 
 def test_error_of_values_that_differ_by_rounding_is_zero() -> None:
-    """Where two seeds are equal to the last bit the posterior has no width. Warnings are errors
-    here.
-    """
+    """Where two seeds are equal to the last bit the posterior has no width: no warnings."""
     for rng in map(np.random.default_rng, range(40)):
         under = np.ones((2, 40, 20))
         _, error = standard_errors(
@@ -237,7 +225,5 @@ def test_length_of_a_constant_or_of_too_few_blocks_is_unknown() -> None:
 
 
 def test_error_of_a_drift_of_four_values_takes_two_means_from_them() -> None:
-    """Each half has one degree of freedom: σ² is estimated by Σ (x − mean)² / 2, and both means
-    have half of it.
-    """
+    """Each half has one degree of freedom: σ² is Σ (x − mean)² / 2, and a mean has half of it."""
     assert drift(np.array([0.0, 2.0, 5.0, 7.0])) == (5.0, pytest.approx(np.sqrt(4 / 2)))

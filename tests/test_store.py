@@ -1,6 +1,4 @@
-"""A file is there whole or not at all, and one that is not what was written is known to be
-damaged.
-"""
+"""A file is there whole or not at all; one that is not what was written is damaged."""
 
 from pathlib import Path
 

@@ -1,6 +1,4 @@
-"""Structure of known point sets, networks and forces is found again, and that of a flow obeys the
-laws of shear.
-"""
+"""Structure of known networks is found again, and that of a flow obeys the laws of shear."""
 
 import jax
 import numpy as np

@@ -1,6 +1,4 @@
-"""The numba engine for CUDA devices, on a processor: against the loop for processors, by one lane
-and by many, for races between lanes, and up to the driver of a device, which is acted.
-"""
+"""The engine for CUDA devices, on a processor: against that of processors, for races, acted."""
 
 import ctypes
 import os

@@ -1,6 +1,4 @@
-"""Errors of the theory, factors of the pressure and shares of the clusters are drawn as numbers at
-their places.
-"""
+"""Errors of the theory, factors and shares of clusters are drawn at their places."""
 
 from pathlib import Path
 

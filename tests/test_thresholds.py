@@ -86,9 +86,7 @@ def test_the_last_decision_has_the_stated_rates() -> None:
 
 
 def prepared(monkeypatch: pytest.MonkeyPatch, series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number of chunks and status of preparations whose ln T and ln P are series (2, replicas,
-    chunks).
-    """
+    """Chunks and statuses of preparations whose ln T and ln P are (2, replicas, chunks)."""
     chunks = iter(np.exp(series).transpose(2, 0, 1))
 
     def shear(batch: Batch, *_: Any) -> tuple[Batch, Any]:

@@ -1,6 +1,4 @@
-"""Trajectories come back bit for bit, and other programs see in them the cell, the grains and the
-contacts.
-"""
+"""Trajectories come back bit for bit; others see in them the cell, grains and contacts."""
 
 import os
 import signal
@@ -64,9 +62,7 @@ def drive(flow, run):
 
 @pytest.fixture(scope="module")
 def recorded(flow, flowing, drive, tmp_path_factory):
-    """A file of five frames, ten steps apart, that were driven in blocks of 25 and 15 steps; and
-    the last state.
-    """
+    """Five frames, ten steps apart, driven in blocks of 25 and 15; and the last state."""
     path = tmp_path_factory.mktemp("trajectory") / "flow.gsd"
     recorder = Recorder(0.0101, partial(write_frame, path))
     end, tallies = driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (25, 15))

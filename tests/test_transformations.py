@@ -1,6 +1,4 @@
-"""Every public name is transformed by JAX, or says in one sentence that it is not and what is;
-nothing runs here.
-"""
+"""Every public name is transformed by JAX, or says that it is not; nothing runs here."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,6 +1,4 @@
-"""What the reference table says of a flow: surfaces against algebra, series against the theory,
-verdicts, intervals.
-"""
+"""What the reference table says: surfaces against algebra, series, verdicts, intervals."""
 
 import json
 import subprocess
@@ -283,9 +281,7 @@ def test_the_command_writes_the_law_of_python_and_replaces_no_file(tmp_path: Pat
 
 
 def test_intervals_hold_on_fresh_flows_as_often_as_they_say(result: dict) -> None:
-    """The committed coverage is that of the table in this package, and 95 % is within binomial
-    error of it.
-    """
+    """The committed coverage is that of this table, with 95 % within its binomial error."""
     fresh = json.loads((RESULTS / "reference_runs.json").read_text(encoding="utf-8"))["rows"]
     coverage = reference.coverage(list(reference.judged(shipped_table(), fresh)))
     for name, committed in result["coverage"].items():

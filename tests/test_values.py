@@ -1,6 +1,4 @@
-"""States, flows, samples and snapshots are values: compared, indexed and counted, and their
-averages are attributes.
-"""
+"""States, flows, samples and snapshots are values: compared, indexed, counted, averaged."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,6 +1,4 @@
-"""Velocity scales: which part of the granular temperature is local, and which stands in the longest
-waves.
-"""
+"""Which part of the granular temperature is local, and which is in the longest waves."""
 
 from dataclasses import replace
 
@@ -100,9 +98,7 @@ def test_few_grains_are_one_box(count):
 
 
 def test_the_local_temperature_is_averaged_as_well_as_the_granular_temperature():
-    """In a dense dissipative flow, where both fluctuate alike; one reading a block had three times
-    the error.
-    """
+    """In dense dissipative flow, where both fluctuate alike; one reading a block did worse."""
     flow = jg.ShearFlow(64, 0.2, 0.8, 1e-3)
     state = jg.prepare(flow, jax.random.key(0))
     _, sample = jg.sample(flow, state, 80.0)

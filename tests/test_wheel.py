@@ -38,9 +38,7 @@ SMALL_MAP = (
 
 @pytest.fixture
 def place() -> Iterator[Path]:
-    """A folder that every user can read, with the wheel installed in ``site``, which nobody can
-    write.
-    """
+    """A folder that all can read, with the wheel in ``site``, which nobody can write."""
     folder = Path(tempfile.mkdtemp())
     folder.chmod(0o755)
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
@@ -60,9 +58,7 @@ def place() -> Iterator[Path]:
 
 @pytest.fixture
 def anyone(place: Path) -> tuple[str, dict[str, Any], int]:
-    """Interpreter, arguments of a process and number of the user: nobody, if some interpreter lets
-    root be so.
-    """
+    """Interpreter, arguments of a process, user: nobody, if an interpreter lets root be so."""
     if os.getuid() == 0:
         import pwd
 
