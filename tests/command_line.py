@@ -26,9 +26,8 @@ from jaxgran.model.status import Status
 POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
 
 
-commands = cache(
-    typer.main.get_command
-)  # Typer makes them anew at every call, which takes longer than a mistake
+# Typer makes them anew at every call, which takes longer than a mistake
+commands = cache(typer.main.get_command)
 
 
 class Outcome(NamedTuple):

@@ -70,9 +70,8 @@ def random_network(
     i, j = i[keep], j[keep]
     sites = sites + rng.uniform(-0.15, 0.15, sites.shape)
     masses = heaviest ** rng.uniform(0, 1, MAX_DISCS)
-    velocities = (
-        rng.normal(size=(MAX_DISCS, 2)) - rng.uniform(0, 2) * sites
-    )  # some of them rush together
+    # some of them rush together
+    velocities = rng.normal(size=(MAX_DISCS, 2)) - rng.uniform(0, 2) * sites
     normals = sites[i] - sites[j]
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     approach = np.sum(normals * (velocities[i] - velocities[j]), axis=1)

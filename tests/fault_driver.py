@@ -8,9 +8,8 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-os.environ.setdefault(
-    "TF_CPP_MIN_LOG_LEVEL", "3"
-)  # as the command line does, before JAX is imported
+# as the command line does, before JAX is imported
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 from jaxgran.maps import batches, blocks, run
 
@@ -41,8 +40,7 @@ if FAULT == "disc full":
 if __name__ == "__main__":
     from jaxgran.cli.app import program
 
-    signal.signal(
-        signal.SIGINT, signal.default_int_handler
-    )  # a shell ignores it for what it runs in the background
+    # a shell ignores it for what it runs in the background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
     program()

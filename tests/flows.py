@@ -1,4 +1,4 @@
-"""Flows of ``GRAINS`` grains, engines that are compiled once for them, and when runs are the same."""
+"""Flows of ``GRAINS`` grains, engines compiled once for them, and when runs are the same."""
 
 from dataclasses import replace
 from functools import cache
@@ -28,9 +28,8 @@ from jaxgran.sampling.packing import pack
 GRAINS = 32
 COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "status")
 
-OF_INSTANTS = tuple(
-    name for name, row in TABLE.items() if row["kind"] == INSTANT
-)  # those of the end of an advance
+# those of the end of an advance
+OF_INSTANTS = tuple(name for name, row in TABLE.items() if row["kind"] == INSTANT)
 
 # Not the same where impulses agree to rounding only: what measures how well a network was solved.
 OF_THE_SOLVER = ("worst_residual", "complementarity", "iterations", "momentum_drift", "overlap")

@@ -19,15 +19,8 @@ MARKUP = (
 @cache
 def page_map() -> xr.DataTree:
     """A map of 2 × 2 × 3 points: one is bad, one was not run; names and attributes hold markup."""
-    settings = MapSettings(
-        (0.5, 0.7, 0.9),
-        (0.5, 0.6),
-        grains=64,
-        seeds=2,
-        timestep=(1e-3, 5e-4),
-        strain=2.0,
-        snapshots=True,
-    )
+    plane, numbers = ((0.5, 0.7, 0.9), (0.5, 0.6)), {"grains": 64, "seeds": 2, "strain": 2.0}
+    settings = MapSettings(*plane, **numbers, timestep=(1e-3, 5e-4), snapshots=True)
     rng, results = np.random.default_rng(0), []
     for point in range(len(settings.points)):
         status = Status.deep_overlap if point == 7 else Status.ok

@@ -29,15 +29,8 @@ SNAPSHOTS = (
 
 def random_tally(rng: np.random.Generator, *shape: int, status: int = 0) -> Tally:
     """Return a tally of positive sums, of whole steps and contacts, with any leading axes."""
-    counts = (
-        "steps",
-        "contacts",
-        "loaded_contacts",
-        "collisions",
-        "solves",
-        "iterations",
-        "unconverged",
-    )
+    counts = {"steps", "solves", "iterations", "unconverged"}
+    counts |= {"contacts", "loaded_contacts", "collisions"}
     values = {}
     for name in TABLE:
         tail = (2, 2) if name.endswith("moment") else ()
@@ -97,10 +90,8 @@ def random_state(seed: int, grains: int = 20, side: float = 10.0) -> State:
     """Return grains of random sizes and velocities at random places of a cell."""
     rng = np.random.default_rng(seed)
     radii = rng.uniform(0.3, 0.7, grains)
-    positions, velocities = (
-        rng.uniform(-side / 2, side / 2, (grains, 2)),
-        rng.normal(size=(grains, 2)),
-    )
+    positions = rng.uniform(-side / 2, side / 2, (grains, 2))
+    velocities = rng.normal(size=(grains, 2))
     return State(
         Grains(radii, 4 * radii**2), positions, velocities, np.float64(side), np.float64(0.2)
     )
@@ -134,28 +125,14 @@ def snapshot_of(
         for k, (a, b, p) in enumerate(here):
             i[t, k], j[t, k], impulses[t, k], used[t, k] = a, b, p, True
     time = np.arange(times)[:, None]
-    branch = (
-        np.stack(
-            [
-                minimum_image(r[a] - r[b], side, tilt)
-                for r, a, b in zip(positions, i, j, strict=True)
-            ]
-        )
-        + np.where(used, 0, 1)[..., None]
-    )
+    apart = [r[a] - r[b] for r, a, b in zip(positions, i, j, strict=True)]
+    branch = np.stack([minimum_image(x, side, tilt) for x in apart])
+    branch = branch + np.where(used, 0, 1)[..., None]
     distances = np.linalg.norm(branch, axis=-1)
     every = np.ones(times)
     masses = 4 * radii**2
-    network = Contacts(
-        i,
-        j,
-        branch / distances[..., None],
-        distances,
-        -impulses,
-        1 / masses[time, i],
-        1 / masses[time, j],
-        used,
-    )
+    normals, inverse = branch / distances[..., None], (1 / masses[time, k] for k in (i, j))
+    network = Contacts(i, j, normals, distances, -impulses, *inverse, used)
     velocities = np.zeros_like(positions) if velocities is None else velocities
     state = State(Grains(radii, masses), positions, velocities, side * every, tilt * every)
     return Snapshot(

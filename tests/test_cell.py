@@ -80,12 +80,10 @@ def test_remapped_tilt_is_the_same_lattice(seed, side, tilt):
 def test_separations_of_images_change_at_the_relative_velocity(seed, side, tilt):
     """Grains fly straight in the laboratory, image rows slide: so separations change linearly."""
     rng = np.random.default_rng(seed)
-    positions, velocities, shear_rate, time = (
-        points(seed, side)[0],
-        rng.normal(size=(POINTS, 2)),
-        1.3,
-        1e-3,
-    )
+    positions = points(seed, side)[0]
+    velocities = rng.normal(size=(POINTS, 2))
+    shear_rate = 1.3
+    time = 1e-3
     i, j = np.arange(POINTS), np.roll(np.arange(POINTS), 1)
     before = np.asarray(measured(positions[i], positions[j], side, tilt))
     laboratory = velocities + shear_rate * positions[:, 1:] * [1, 0]

@@ -308,17 +308,14 @@ def test_a_reader_that_has_gone_ends_a_command_in_silence(tmp_path: Path) -> Non
 
 @pytest.mark.skipif(os.name != "posix", reason="a shell of another kind")
 @pytest.mark.parametrize(
-    "words",
-    [
-        "info",
-        "where --restitution 0.5 --packing-fraction 0.6",
-        SMALL_RUN,
-    ],
+    "words", ["info", "where --restitution 0.5 --packing-fraction 0.6", SMALL_RUN]
 )
 def test_a_command_without_a_standard_output_ends_as_ever(words: str, tmp_path: Path) -> None:
     """As in ``jaxgran info >&-``."""
     command = ["sh", "-c", f'exec "$0" -m jaxgran {words} >&-', sys.executable]
-    done = subprocess.run(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    flags = {"JAX_NUMPY_DTYPE_PROMOTION": "strict", "JAX_NUMPY_RANK_PROMOTION": "raise"}
+    variables = os.environ | flags  # programs of other tests are loaded
+    done = subprocess.run(command, cwd=tmp_path, env=variables, stderr=subprocess.PIPE, text=True)
     assert done.returncode in (0, 3) and "Traceback" not in done.stderr
 
 

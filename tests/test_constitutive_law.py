@@ -8,15 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import jaxgran as jg
 from jaxgran.reference.law import ConstitutiveLaw
 from jaxgran.reference.table import LENGTH, MEASURED, read_columns
 
 LAW = jg.constitutive_law()
-ALPHAS, NUS = (st.floats(*one) for one in (LAW.restitution_range, LAW.packing_fraction_range))
 PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "constitutive-law.md"
 
 
@@ -27,15 +24,14 @@ def a_plane(rows: int = 15) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-@settings(max_examples=20, deadline=None)
-@given(ALPHAS, NUS, st.floats(1e-3, 1e3))
-def test_bagnolds_scaling_is_exact(alpha: float, nu: float, rate: float) -> None:
-    slow, fast = LAW(alpha, nu)._asdict(), LAW(alpha, nu, rate)._asdict()
+@pytest.mark.parametrize("rate", [1e-3, 3.0, 1e3])
+def test_bagnolds_scaling_is_exact(rate: float) -> None:
+    slow, fast = LAW(*a_plane())._asdict(), LAW(*a_plane(), rate)._asdict()
     for name in MEASURED:
         power = 3 if name == "dissipation_rate" else 2
         expected = np.multiply(slow[name], rate**power)
         np.testing.assert_allclose(fast[name], expected, rtol=1e-14)
-    assert fast[LENGTH] == slow[LENGTH]
+    np.testing.assert_array_equal(fast[LENGTH], slow[LENGTH])
 
 
 def test_power_of_the_shear_is_dissipated_within_the_errors() -> None:
@@ -114,9 +110,8 @@ def test_arrays_broadcast_with_the_shear_rate() -> None:
     same, same_half_widths = np.stack(compiled, axis=1)
     assert averages.shape[1:] == (2, 3)
     np.testing.assert_allclose(averages, same, rtol=1e-7)
-    np.testing.assert_allclose(
-        half_widths / averages, same_half_widths / averages, atol=1e-6
-    )  # small differences
+    # small differences
+    np.testing.assert_allclose(half_widths / averages, same_half_widths / averages, atol=1e-6)
     assert flow.pressure.value[1, 2] == pytest.approx(LAW(0.6, 0.7, 3.0).pressure.value)
 
 
@@ -141,19 +136,11 @@ def test_the_file_is_the_law_at_its_points_and_says_what_it_is(tmp_path: Path) -
     for name, (value, ci95) in LAW(*flows)._asdict().items():
         np.testing.assert_allclose(columns[name], value, rtol=1e-5)
         np.testing.assert_allclose(columns[f"{name}_ci95"], ci95, rtol=1e-5)
-    for x, (low, high) in zip(
-        flows, (LAW.restitution_range, LAW.packing_fraction_range), strict=True
-    ):
-        assert x.min() == low and x.max() == high
+    ranges = LAW.restitution_range, LAW.packing_fraction_range
+    assert [(x.min(), x.max()) for x in flows] == [*ranges]
     assert head["version"] == jg.__version__
-    assert {
-        "maps",
-        "grains",
-        "timestep",
-        "ci95",
-        "units",
-        *(f"unit of {x}" for x in (*MEASURED, LENGTH)),
-    } <= {*head}
+    units = {f"unit of {x}" for x in (*MEASURED, LENGTH)}
+    assert {"maps", "grains", "timestep", "ci95", "units"} | units <= {*head}
     with pytest.raises(jg.InputError, match=r"law\.csv' already exists"):
         LAW.to_csv(tmp_path / "law.csv", [0.5, 0.6], [0.7])
     LAW.to_csv(tmp_path / "law.csv", [0.5, 0.6], [0.7], overwrite=True)

@@ -50,9 +50,8 @@ def test_contact_is_a_pair_that_the_flight_makes_overlap(seed, look_ahead):
     )
     times = np.linspace(0, look_ahead, INSTANTS)
     along = excess(separations, velocities, reach, times[:, None] * np.ones(PAIRS))
-    towards = (
-        np.sum(separations * velocities, axis=1) < 0
-    )  # even if the closest approach is before the next instant
+    # even if the closest approach is before the next instant
+    towards = np.sum(separations * velocities, axis=1) < 0
     deepest = np.where(towards, np.min(along, axis=0), along[-1])
     # between two instants the squared distance falls below both by at most (half their distance in
     # space)²

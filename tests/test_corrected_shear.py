@@ -36,10 +36,8 @@ def batched(laws_are_zero: bool = False):
 
 
 def test_without_corrections_the_theory_is_that_of_the_moments() -> None:
-    predicted, expected = (
-        batched(laws_are_zero=True)(*PLANE),
-        jax.jit(jax.vmap(gaussian_moments))(*PLANE),
-    )
+    predicted = batched(laws_are_zero=True)(*PLANE)
+    expected = jax.jit(jax.vmap(gaussian_moments))(*PLANE)
     for name in STATE:
         np.testing.assert_allclose(getattr(predicted, name), getattr(expected, name), rtol=1e-12)
     np.testing.assert_array_equal(predicted.correlation_length, 1)
@@ -76,9 +74,8 @@ def test_dissipation_is_enskogs_times_pairs_over_length() -> None:
     for _ in range(20):  # Newton: two unknowns of the tensor, from shear stress and dissipation
         unknowns = unknowns - jnp.linalg.solve(slopes(unknowns), misfit(unknowns) - target)
     np.testing.assert_allclose(misfit(unknowns), target, rtol=1e-10)
-    np.testing.assert_allclose(
-        stresses(tensor_of(unknowns))[0][0], total[0], rtol=1e-8
-    )  # the pressure follows
+    # the pressure follows
+    np.testing.assert_allclose(stresses(tensor_of(unknowns))[0][0], total[0], rtol=1e-8)
 
 
 def test_stresses_grow_with_the_square_of_the_shear_rate() -> None:

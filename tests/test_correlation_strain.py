@@ -59,6 +59,5 @@ def test_correlation_strain_of_seeds_of_unequal_length_is_that_of_their_flow():
             )
             seeds.append(sample_of_tally(tally, ShearFlow(100, 0.5, 0.6, 1e-3)))
         found.append(correlation_strains(seeds)["granular_temperature"])
-    assert np.mean(found) == pytest.approx(
-        80, rel=0.25
-    )  # 8 % standard error; a short series shows less
+    # 8 % standard error; a short series shows less
+    assert np.mean(found) == pytest.approx(80, rel=0.25)

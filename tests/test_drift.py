@@ -28,9 +28,8 @@ def sample_of(seed: int, growth: float) -> Sample:
 def test_a_drift_that_all_seeds_share_is_one() -> None:
     assert is_drifting([sample_of(seed, 1.6) for seed in range(4)], correlation_strain=1.0)
     assert is_drifting([sample_of(0, 1.6)], correlation_strain=1.0)
-    assert not is_drifting(
-        [sample_of(seed, 1.1) for seed in range(4)], correlation_strain=1.0
-    )  # less than is accepted
+    # less than is accepted
+    assert not is_drifting([sample_of(seed, 1.1) for seed in range(4)], correlation_strain=1.0)
 
 
 def test_seeds_that_drift_against_each_other_are_steady_together() -> None:

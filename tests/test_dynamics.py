@@ -1,22 +1,13 @@
 """The advance over many steps: exact flight, one trajectory by every route, statuses."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flows import (
-    EXACT,
-    GRAINS,
-    OF_INSTANTS,
-    assert_same_bits,
-    assert_same_state,
-    assert_same_tally,
-    flow_of,
-    replica,
-    stacked,
-)
+from flows import EXACT, GRAINS, OF_INSTANTS, assert_same_state, assert_same_tally, flow_of, stacked
 from jax.extend.core import jaxprs_in_params
 from oracles import gaps_of
 
@@ -179,88 +170,23 @@ def test_a_traced_number_that_a_flow_refuses_ends_it_at_once(engine, flowing, ba
     assert jax.jit(status)(*bad.values()) == Status.nonfinite
 
 
-# Three replicas with numbers of their own
-
-
-@pytest.fixture(scope="module")
-def replicas(flowing):
-    """Flows and states of three replicas, stacked."""
-    points = [(0.6, 0.5), (0.75, 0.1), (0.5, 0.9)]
-    flows = [flow_of(nu, restitution=alpha) for nu, alpha in points]
-    states = [flowing(nu) for nu, _ in points]
-    return stacked(flows), stacked(states)
-
-
-def exact_advance(flow, state, steps):
-    return advance_by_jax(flow, EXACT, state, steps)
-
-
-@pytest.fixture(scope="module")
-def traced_batch(replicas):
-    batch = jax.vmap(exact_advance, in_axes=(0, 0, None))
-    return jax.jit(batch).trace(*replicas, jnp.int32(0))
-
-
-@pytest.fixture(scope="module")
-def batch_advance(traced_batch):
-    """The advance of all replicas at once; one after the other, they do not meet."""
-    # Sums of loops by the older emitter depend on what else is in an array; users have the newer
-    # one.
-    return traced_batch.lower().compile({"xla_cpu_use_fusion_emitters": True})
-
-
-@pytest.fixture(scope="module")
-def healthy(replicas, batch_advance):
-    """States and tallies of the replicas after 200 steps."""
-    return batch_advance(*replicas, jnp.int32(200))
-
-
-def test_batch_advances_as_single_runs_do(run, replicas, batch_advance):
-    flows, states = replicas
-    after, tallies = batch_advance(flows, states, jnp.int32(100))
-    for index in range(3):
-        flow = jax.tree.map(lambda leaf, index=index: leaf[index].item(), flows)
-        single, tally = run(flow, replica(states, index), 100)
-        assert tally.solves > 0
-        assert_same_state(replica(after, index), single, 1e-10)
-        assert_same_tally(replica(tallies, index), tally, 1e-10)
-
-
-def test_replica_is_the_same_to_the_bit_whatever_its_neighbours(
-    flowing, replicas, batch_advance, healthy
-):
-    others = stacked([flowing(0.6), flowing(0.8, 1), flowing(0.1, 1)])
-    changed = batch_advance(replicas[0], others, jnp.int32(200))
-    assert_same_bits(replica(healthy, 0), replica(changed, 0))
-
-
-@pytest.mark.parametrize("field", ["positions", "velocities"])
-def test_replica_that_is_not_finite_leaves_the_others_alone(
-    replicas, batch_advance, healthy, field
-):
-    flows, states = replicas
-    spoilt = replace(states, **{field: getattr(states, field).at[1, 0, 0].set(jnp.nan)})
-    result = batch_advance(flows, spoilt, jnp.int32(200))
-    np.testing.assert_array_equal(result[1].status, [Status.ok, Status.nonfinite, Status.ok])
-    for index in (0, 2):
-        assert_same_bits(replica(result, index), replica(healthy, index))
-
-
 def equations_of(jaxpr) -> list:
     """All equations of a program, those of its branches and loops included."""
     inner = [each for equation in jaxpr.eqns for each in jaxprs_in_params(equation.params)]
     return [*jaxpr.eqns, *(equation for each in inner for equation in equations_of(each))]
 
 
-def test_control_flow_of_a_batch_stays_control_flow(traced_batch):
+def test_control_flow_of_a_batch_stays_control_flow(flowing):
     """A predicate that differs between replicas would pay for all branches, for all replicas."""
-    least = 3 + len(
-        contact_buffers(GRAINS)
-    )  # the loops over lists and events, and a solve of each size and of all
+    # the loops over lists and events, and a solve of each size and of all
+    least = 3 + len(contact_buffers(GRAINS))
+    points = [(0.6, 0.5), (0.75, 0.1), (0.5, 0.9)]
+    flows = stacked([flow_of(nu, restitution=alpha) for nu, alpha in points])
+    states = stacked([flowing(nu) for nu, _ in points])
+    batch = jax.vmap(partial(advance_by_jax, steps=jnp.int32(0)), in_axes=(0, None, 0))
+    jaxpr = jax.make_jaxpr(batch)(flows, EXACT, states).jaxpr
     for name in ("cond", "while"):
-        equations = [
-            each for each in equations_of(traced_batch.jaxpr.jaxpr) if each.primitive.name == name
-        ]
+        equations = [each for each in equations_of(jaxpr) if each.primitive.name == name]
         assert len(equations) >= least
         for equation in equations:
             if name == "cond":

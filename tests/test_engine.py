@@ -14,7 +14,6 @@ from test_batching import compiled
 import jaxgran as jg
 from jaxgran.contact.projected_methods import solver_name
 from jaxgran.dynamics.engine import Numerics, _warn_once, select_engine
-from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.environment import on_processor
 from jaxgran.maps.attributes import from_attrs
 from jaxgran.maps.dataset import map_dataset
@@ -99,14 +98,6 @@ def test_an_engine_that_cannot_do_what_is_asked_says_so(case: str, flowing) -> N
 # What runs
 
 
-def test_the_machine_code_by_name_is_auto_to_the_bit(flowing) -> None:
-    state, (numba, auto) = (
-        flowing(0.7),
-        (jax.jit(partial(jg.advance, engine=one)) for one in (jg.Numba(), None)),
-    )
-    assert_same_bits(numba(of(), state, STEPS), auto(of(), state, STEPS))
-
-
 def test_a_number_of_steps_may_be_one_of_python(flowing) -> None:
     one, *others = (jg.advance(of(), flowing(0.7), n) for n in (100, np.int64(100), STEPS))
     for other in others:
@@ -124,10 +115,10 @@ def test_a_part_of_a_state_may_be_traced(flowing) -> None:
 
 
 @pytest.mark.parametrize("numerics", [{"engine": jg.Jax()}, {"solver": jg.Jacobi()}])
-def test_jax_by_name_and_for_another_solver_is_the_plain_advance(numerics, flowing) -> None:
+def test_jax_by_name_and_for_another_solver_is_the_plain_advance(numerics, flowing, run) -> None:
     solver = numerics.get("solver", jg.BarzilaiBorwein())
     chosen = jax.jit(partial(jg.advance, **numerics))(of(), flowing(0.7), STEPS)
-    assert_same_bits(chosen, jax.jit(advance_by_jax)(of(), solver, flowing(0.7), STEPS))
+    assert_same_bits(chosen, run(of(), flowing(0.7), STEPS, solver=solver))
 
 
 @pytest.mark.parametrize(

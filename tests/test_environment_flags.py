@@ -85,7 +85,7 @@ def test_a_user_without_a_home_has_no_cache_there(monkeypatch) -> None:
 def test_flags_with_which_nothing_is_compiled_are_named(name, value, tmp_path, monkeypatch) -> None:
     """By a user without a compiled engine on disk."""
     monkeypatch.setenv(name, value)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     flow = ("--restitution", "0.5", "--packing-fraction", "0.5", "-n", "16")
     done = in_a_process(tmp_path, "run", *flow, "--strain", "1", "--equilibrate", "0.1")
     sentence = done.err.splitlines()[-1]

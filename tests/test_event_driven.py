@@ -71,15 +71,10 @@ def test_elastic_gas_has_the_rate_and_pressure_of_enskog() -> None:
     values = averages(sums, gas)
     np.testing.assert_allclose(values["granular_temperature"], 1, rtol=1e-9)
     chi, density = (1 - 7 * fraction / 16) / (1 - fraction) ** 2, 4 * fraction / np.pi
-    expected = {
-        "collision_rate": 2
-        * density
-        * chi
-        * np.sqrt(np.pi)
-        * np.sqrt(count / (count - 1)),  # without total momentum
-        "pressure": density * (1 + 2 * fraction * chi),
-    }
-    for name, value in expected.items():
+    rate = 2 * density * chi * np.sqrt(np.pi)
+    rate *= np.sqrt(count / (count - 1))  # without total momentum
+    pressure = density * (1 + 2 * fraction * chi)
+    for name, value in {"collision_rate": rate, "pressure": pressure}.items():
         error = values[name].std(ddof=1) / np.sqrt(len(values[name]))
         assert error < 0.01 * value
         assert abs(values[name].mean() - value) < 4 * error + 0.003 * value

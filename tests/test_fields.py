@@ -230,9 +230,8 @@ def test_averages_over_the_cell_are_the_virial_sums(seen) -> None:
     np.testing.assert_allclose(mean(fields.density), np.sum(masses) / area, rtol=tolerance)
     np.testing.assert_allclose(mean(fields.number_density), GRAINS / area, rtol=tolerance)
     loss = np.sum(masses[:, None] * (np.asarray(seen.state.velocities) ** 2 - c**2)) / 2
-    loss -= (
-        float(seen.timestep) * virial[0, 1] * area
-    )  # the shear works on the contact stress while they touch
+    # the shear works on the contact stress while they touch
+    loss -= float(seen.timestep) * virial[0, 1] * area
     np.testing.assert_allclose(
         mean(fields.dissipation), loss / (area * float(seen.timestep)), rtol=1e-5
     )
@@ -327,10 +326,8 @@ def test_temperature_has_nothing_of_the_mean_flow_whose_share_of_the_kinetic_str
 def virial_stress(seen: Snapshot) -> np.ndarray:
     """Σ^{yb}: of the contacts, and of the grains over their flight, where c_x falls by γ̇ c_y t."""
     area, dt = float(seen.state.side) ** 2, float(seen.timestep)
-    normals, pushed = (
-        np.asarray(seen.contacts.normals),
-        np.asarray(seen.impulses * seen.contacts.distances) / dt,
-    )
+    normals = np.asarray(seen.contacts.normals)
+    pushed = np.asarray(seen.impulses * seen.contacts.distances) / dt
     masses, c = np.asarray(seen.state.grains.masses), np.array(collided(seen).velocities)
     c[:, 0] -= c[:, 1] * dt / 2
     return ((pushed * normals[:, 1]) @ normals + (masses * c[:, 1]) @ c) / area

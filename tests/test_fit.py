@@ -29,10 +29,8 @@ def starts() -> jg.State:
 
 def noisy(state: jg.State, seed: int) -> jg.State:
     rng, shape = np.random.default_rng(seed), state.positions.shape
-    positions, velocities = (
-        state.positions + POSITION * rng.normal(size=shape),
-        VELOCITY * rng.normal(size=shape),
-    )
+    positions = state.positions + POSITION * rng.normal(size=shape)
+    velocities = VELOCITY * rng.normal(size=shape)
     return replace(state, positions=positions, velocities=state.velocities + velocities)
 
 

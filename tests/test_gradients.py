@@ -22,6 +22,7 @@ from jaxgran.contact.problem import ContactNetwork
 from jaxgran.contact.projected_methods import BarzilaiBorwein, Nesterov
 from jaxgran.contact.solve_contacts import solve_contacts
 from jaxgran.contact.solver import solve
+from jaxgran.dynamics import jax_engine
 from jaxgran.dynamics.advance import count_events
 from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.dynamics.moving_contacts import displaced
@@ -176,20 +177,12 @@ def test_velocities_are_differentiable_where_impulses_are_not_unique():
 
 # Through time
 
-NAMES = (
-    "restitution",
-    "shear_rate",
-    "timestep",
-    "side",
-    "radii",
-    "masses",
-    "positions",
-    "velocities",
-)
+NUMBERS = ["restitution", "shear_rate", "timestep"]  # of the flow
+NAMES = [*NUMBERS, "side", "radii", "masses", "positions", "velocities"]
 
 
 def parameters(flow: ShearFlow, state: State) -> dict:
-    numbers = {name: jnp.asarray(getattr(flow, name), float) for name in NAMES[:3]}
+    numbers = {name: jnp.asarray(getattr(flow, name), float) for name in NUMBERS}
     own = {"side": state.side, "radii": state.grains.radii, "masses": state.grains.masses}
     return numbers | own | {"positions": state.positions, "velocities": state.velocities}
 
@@ -200,7 +193,7 @@ def exact_advance(flow, *arguments, **options):
 
 def changed(flow: ShearFlow, state: State, values: dict) -> tuple[ShearFlow, State]:
     """The flow and the state with these parameters."""
-    flow = replace(flow, **{name: values[name] for name in NAMES[:3]})
+    flow = replace(flow, **{name: values[name] for name in NUMBERS})
     grains = Grains(values["radii"], values["masses"])
     return flow, State(
         grains, values["positions"], values["velocities"], values["side"], state.tilt
@@ -357,7 +350,7 @@ def test_displaced_grains_have_their_velocities_in_the_laboratory(flowing) -> No
     np.testing.assert_allclose(after.y - pairs.y, apart[:, 1], atol=1e-9)
 
 
-def test_at_a_kink_the_derivative_is_one_of_the_two_one_sided_ones(scene):
+def test_at_a_kink_the_derivative_is_one_of_the_two_one_sided_ones(scene, run, monkeypatch):
     """A disc hits a second one that a third one touches at a right angle: the third contact neither
     presses nor parts.
 
@@ -367,17 +360,16 @@ def test_at_a_kink_the_derivative_is_one_of_the_two_one_sided_ones(scene):
     touching = scene([[3.0, 4.0], [4.0, 4.0], [4.0, 3.0]], [[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     flow = of_state(ShearFlow(GRAINS, 0.0, 0.02, 1e-6), touching)
 
-    @jax.jit
-    def pushed(slant):
+    def pushed(slant, advanced=exact_advance):
         """Velocity of the third disc along y, where the first one comes at a slant."""
         turn = jnp.stack([jnp.cos(slant), -jnp.sin(slant)])
-        state = replace(
-            touching, positions=touching.positions.at[0].set(touching.positions[1] - turn)
-        )
-        return advance_by_jax(flow, EXACT, state, jnp.int32(2))[0].velocities[2, 1]
+        first = touching.positions.at[0].set(touching.positions[1] - turn)
+        return advanced(flow, replace(touching, positions=first), jnp.int32(2))[0].velocities[2, 1]
 
     at, step = jnp.asarray(0.0), 1e-4
+    left, middle, right = (pushed(at + x, run) for x in (-step, 0, step))
+    sides = [(right - middle) / step, (middle - left) / step]
+    monkeypatch.setattr(jax_engine, "contact_buffers", lambda _: ())  # there is less to compile
     returned = jax.jit(jax.jacfwd(pushed))(at)
-    sides = [(pushed(at + sign * step) - pushed(at)) / (sign * step) for sign in (1, -1)]
     assert abs(sides[0] - sides[1]) > 0.1
     assert min(abs(returned - side) for side in sides) < 1e-3

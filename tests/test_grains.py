@@ -14,9 +14,8 @@ EPS = np.finfo(float).eps
 def test_sample_is_a_stratified_uniform_distribution(count, polydispersity):
     grains = polydisperse(count, polydispersity, jax.random.key(0))
     diameters = 2 * np.asarray(grains.radii)
-    assert (
-        abs(np.mean(diameters) - 1) <= 2 * EPS
-    )  # exactly one, but for the rounding of single diameters
+    # exactly one, but for the rounding of single diameters
+    assert abs(np.mean(diameters) - 1) <= 2 * EPS
     np.testing.assert_array_equal(grains.masses, diameters**2)
     edges = 1 + polydispersity * np.linspace(-1, 1, count + 1)
     middles = (edges[1:] + edges[:-1]) / 2
@@ -31,9 +30,8 @@ def test_key_permutes_the_sizes_and_nothing_else():
     np.testing.assert_array_equal(np.sort(first), np.sort(second))
     assert np.mean(first == second) < 0.2
     neighbours = np.corrcoef(first[1:], first[:-1])[0, 1]
-    assert abs(neighbours) < 4 / np.sqrt(
-        63
-    )  # standard error of a correlation of independent numbers
+    # standard error of a correlation of independent numbers
+    assert abs(neighbours) < 4 / np.sqrt(63)
 
 
 def test_own_grains_are_in_units_of_their_mean_diameter_and_weigh_what_they_are_given():

@@ -94,13 +94,7 @@ def fast_pair(gap: float, speed: float) -> State:
     velocities = np.zeros((GRAINS, 2))
     velocities[:2, 0] = speed, -speed
     grains = Grains(jnp.full(GRAINS, 0.5), jnp.ones(GRAINS))
-    return State(
-        grains,
-        jnp.asarray(positions + 10),
-        jnp.asarray(velocities),
-        jnp.asarray(20.0),
-        jnp.asarray(0.0),
-    )
+    return State(grains, *map(jnp.asarray, (positions + 10, velocities, 20.0, 0.0)))
 
 
 @settings(max_examples=30)
@@ -181,48 +175,27 @@ def test_sums_over_200_steps_are_those_of_the_classical_loop(
     flowing, engine_run, packing_fraction, activation
 ) -> None:
     """Two programs that were written apart, from the same state: contacts, impulses, averages."""
-    state, flow = (
-        flowing(packing_fraction),
-        flow_of(packing_fraction, activation=activation, restitution=0.8),
-    )
+    state = flowing(packing_fraction)
+    flow = flow_of(packing_fraction, activation=activation, restitution=0.8)
     after, tally = engine_run(flow, state, STEPS)
-    grains, law = (
-        state.grains,
-        {"shear_rate": 1.0, "restitution": 0.8, "timestep": DT, "tolerance": 1e-12},
-    )
+    grains = state.grains
+    given = grains.radii, grains.masses, state.side
+    law = {"shear_rate": 1.0, "restitution": 0.8, "timestep": DT, "tolerance": 1e-12}
+    law["activation"] = THETA[activation]
     at, sums = (state.positions, state.velocities, state.tilt), np.zeros(11)
     for _ in range(STEPS):
-        *at, step = contact_dynamics.advance(
-            at[0],
-            at[1],
-            grains.radii,
-            grains.masses,
-            state.side,
-            at[2],
-            activation=THETA[activation],
-            **law,
-        )
+        *at, step = contact_dynamics.advance(*at[:2], *given, at[2], **law)
         begin = at[1] + DT * np.stack([at[1][:, 1], np.zeros(GRAINS)], axis=1)  # after the impulses
         kinetic = sum(
             w * np.einsum("i,ia,ib->ab", grains.masses, c, c) for w, c in simpson(begin, at[1])
         )
-        step_sums = (
-            step.impulse,
-            step.binary_impulse,
-            *step.contact_stress,
-            *step.binary_stress,
-            *symmetric(kinetic),
-        )
-        sums += step_sums
+        stresses = *step.contact_stress, *step.binary_stress, *symmetric(kinetic)
+        sums += (step.impulse, step.binary_impulse, *stresses)
     area = float(state.side) ** 2
     assert float(tally.collisions) > 5
-    moments = (np.asarray(tally.contact_moment), np.asarray(tally.binary_moment))
-    tally_sums = [
-        tally.impulse,
-        tally.binary_impulse,
-        *(x for m in moments for x in symmetric(m) / (area * DT)),
-    ]
-    tally_sums = np.array([*tally_sums, *symmetric(np.asarray(tally.kinetic_moment)) / DT], float)
+    per_step = (tally.contact_moment / area, tally.binary_moment / area, tally.kinetic_moment)
+    moments = (x for moment in per_step for x in symmetric(np.asarray(moment)) / DT)
+    tally_sums = np.array([tally.impulse, tally.binary_impulse, *moments], float)
     scale = np.repeat([np.max(np.abs(part)) for part in np.split(sums, [2, 5, 8])], [2, 3, 3, 3])
     np.testing.assert_allclose(tally_sums / scale, sums / scale, atol=1e-6)
     moved = displacement(after.positions, jnp.asarray(at[0]), after.side, after.tilt)

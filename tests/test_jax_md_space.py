@@ -13,9 +13,8 @@ import jaxgran as jg
 from jaxgran.model.cell import displacement
 from jaxgran.model.state import State
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:scatter inputs have incompatible types"
-)  # of jax-md's lists
+# of jax-md's lists
+pytestmark = pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types")
 TILTS = (-0.5, 0.3)
 CUTOFF = 1.6  # σ
 EPS = np.finfo(float).eps

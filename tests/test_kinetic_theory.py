@@ -93,9 +93,8 @@ def test_collisions_are_those_of_the_velocities_in_the_source(restitution):
     maxwellian = 2 * speed * 4 * nu / np.pi * contact_value(nu)
     excess = float(predicted.collision_rate / maxwellian) - 1
     assert abs(excess) > 1e-4
-    assert excess == pytest.approx(
-        change * kurtosis, rel=0.1
-    )  # of the quadrature, whose integrand has a cusp
+    # of the quadrature, whose integrand has a cusp
+    assert excess == pytest.approx(change * kurtosis, rel=0.1)
 
 
 @pytest.mark.parametrize("theory", THEORIES)
@@ -130,9 +129,8 @@ def test_theories_of_one_size_agree_in_the_elastic_limit(packing_fraction):
         ).max()
 
     assert distance(1 - 1e-4) < 1e-3
-    np.testing.assert_allclose(
-        distance(1 - 1e-4) / distance(1 - 1e-3), 0.1, rtol=0.05
-    )  # first order in 1 − α
+    # first order in 1 − α
+    np.testing.assert_allclose(distance(1 - 1e-4) / distance(1 - 1e-3), 0.1, rtol=0.05)
 
 
 def test_velocities_become_isotropic_in_the_elastic_limit():
@@ -141,9 +139,8 @@ def test_velocities_become_isotropic_in_the_elastic_limit():
         nearly.shear_stress / nearly.pressure,
         more_nearly.shear_stress / more_nearly.pressure,
     )
-    np.testing.assert_allclose(
-        friction[1] / friction[0], 0.1, rtol=0.01
-    )  # as the square root of 1 − α
+    # as the square root of 1 − α
+    np.testing.assert_allclose(friction[1] / friction[0], 0.1, rtol=0.01)
 
 
 def test_one_size_is_the_limit_of_many():
@@ -173,9 +170,8 @@ def test_collisional_transfer_of_slow_shear_has_the_viscosity_of_isotropic_colli
     np.testing.assert_allclose(
         -transfer.stress[0, 1] / rate, bulk / 2 * np.sqrt(temperature / (4 * np.pi)), rtol=1e-6
     )
-    speed = (
-        transfer.speed_stress[0, 0] / transfer.stress[0, 0]
-    )  # ⟨w³⟩ / ⟨w²⟩ of a half-Gaussian of variance 2T
+    # ⟨w³⟩ / ⟨w²⟩ of a half-Gaussian of variance 2T
+    speed = transfer.speed_stress[0, 0] / transfer.stress[0, 0]
     np.testing.assert_allclose(speed, 2 * np.sqrt(2 / np.pi) * np.sqrt(2 * temperature), rtol=1e-6)
 
 
@@ -204,9 +200,8 @@ def test_collision_integrals_equal_averages_over_sampled_collisions():
                 for k in (i, j)
             )
             relative = own - other
-            relative[:, 0] -= (
-                distance * normal[:, 1]
-            )  # the flow at the partner's centre, shear rate 1
+            # the flow at the partner's centre, shear rate 1
+            relative[:, 0] -= distance * normal[:, 1]
             approach = np.maximum(np.sum(relative * normal, axis=1), 0)
             weight = 2 * np.pi * mixture.encounters[i, j] * approach
             impulse = (1 + alpha) * mixture.reduced_masses[i, j] * approach

@@ -24,17 +24,10 @@ def study(noise: float, seed: int = 0) -> list[dict]:
         for nu in (0.2, 0.5, 0.7, 0.75):
             flow = Flow("", alpha, nu, np.array(GRAINS, float), np.array(()), np.array(()))
             for grains, missing in zip(GRAINS, missing_part(np.array(LAW), flow), strict=True):
-                values = {
-                    name: [2 * (1 - missing) * (1 + noise * rng.normal()), 2 * noise]
-                    for name in AVERAGES
-                }
-                point = {
-                    "restitution": alpha,
-                    "packing_fraction": nu,
-                    "grains": grains,
-                    "source": "loose",
-                }
-                rows.append(point | values)
+                value = 2 * (1 - missing)
+                row = {x: [value * (1 + noise * rng.normal()), 2 * noise] for x in AVERAGES}
+                row |= {"restitution": alpha, "packing_fraction": nu, "grains": grains}
+                rows.append(row | {"source": "loose"})
     return rows
 
 

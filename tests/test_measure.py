@@ -34,9 +34,8 @@ FLOWS = [ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0.5, 0.9)]
 
 @pytest.fixture(scope="module")
 def batch() -> Batch:
-    keys = jax.random.split(
-        jax.random.PRNGKey(0), 2
-    )  # numbers, as in a map: compiled once for both
+    # numbers, as in a map: compiled once for both
+    keys = jax.random.split(jax.random.PRNGKey(0), 2)
     return prepare_batch(stack(FLOWS), keys, equilibrate=0.5)
 
 
@@ -195,7 +194,7 @@ def test_a_sample_below_four_correlation_strains_says_so_however_it_is_taken(sta
     taken = [
         sample(FLOWS[0], state, few),
         jax.jit(lambda state: sample(FLOWS[0], state, few))(state),
-        sample(FLOWS[0], state, few, callback=lambda *_: False),
+        sample(FLOWS[0], state, few, 2, callback=lambda *_: False),
     ]
     assert [int(one.status) for _, one in taken] == [Status.short_sample] * 3
     both = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), state)

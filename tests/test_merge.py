@@ -44,13 +44,19 @@ def replicas() -> dict[tuple[int, int], Replica]:
     return made
 
 
+MADE: dict[Any, xr.DataTree] = {}
+
+
 def of_seeds(
     replicas: dict[tuple[int, int], Replica], first: int, count: int, **change: Any
 ) -> xr.DataTree:
-    """The map of some of the seeds."""
+    """The map of some of the seeds, of which one is made for all tests."""
     settings = replace(SETTINGS, first_seed=first, seeds=count, **change)
-    own = replica_ids(settings)
-    return map_dataset(settings, [x for x in replicas.values() if x.id in own], RUN)
+    key = (settings, len(replicas))
+    if key not in MADE:
+        own = replica_ids(settings)
+        MADE[key] = map_dataset(settings, [x for x in replicas.values() if x.id in own], RUN)
+    return MADE[key].copy()
 
 
 def assert_one_run(merged: xr.DataTree, whole: xr.DataTree, but: tuple[str, ...] = ()) -> None:

@@ -127,9 +127,8 @@ def test_any_flow_takes_its_first_events_as_in_the_plain_advance(
         state = replace(state, tilt=jnp.asarray(tilt, float))
     flow = flow_of(packing_fraction, restitution=restitution, timestep=timestep)
     ours, plain = native_run(flow, state, 5), run(flow, state, 5)
-    assume(
-        plain[1].status < Status.capacity
-    )  # its lists are narrower: the numba engine may still hold such a flow
+    # its lists are narrower: the numba engine may still hold such a flow
+    assume(plain[1].status < Status.capacity)
     assert ours[1].status == plain[1].status
     if plain[1].status < Status.infeasible:
         assert_same(ours, plain, 1e-6 * max(1, speed))
@@ -197,10 +196,8 @@ def test_copies_of_a_cluster_are_solved_as_one_within_the_tolerance(native_run, 
     for copies in (1, 2, 4):
         velocities = np.zeros((GRAINS, 2))
         velocities[(column == 0) & (row < copies), 0] = 1.0
-        state, flow = (
-            state_of(places, velocities, 40.0),
-            flow_of(0.01, restitution=0.0, shear_rate=0.0),
-        )
+        state = state_of(places, velocities, 40.0)
+        flow = flow_of(0.01, restitution=0.0, shear_rate=0.0)
         tallies.append(native_run(flow, state, 1, BarzilaiBorwein(tolerance))[1])
     assert tallies[0].iterations == tallies[1].iterations == tallies[2].iterations > 5
     assert all(0 < tally.worst_residual <= tolerance for tally in tallies)
@@ -279,10 +276,8 @@ def test_senseless_states_come_to_an_end(
     """Whatever a state holds, the loop ends, and nothing is NaN and called ok."""
     rng = np.random.default_rng(0)
     places, velocities = (x * rng.uniform(-1, 1, (GRAINS, 2)) for x in (place, speed))
-    state, flow = (
-        state_of(places, velocities, side, tilt, radius, mass),
-        flow_of(shear_rate=shear_rate),
-    )
+    state = state_of(places, velocities, side, tilt, radius, mass)
+    flow = flow_of(shear_rate=shear_rate)
     after, tally = native_run(flow, state, 20, BarzilaiBorwein(1e-12, 100))
     if not np.all(np.isfinite(after.velocities)):
         assert tally.status == Status.nonfinite

@@ -65,12 +65,8 @@ def all_images(positions, side, tilt, cutoff):
         for a in (-2, -1, 0, 1, 2)
     ]
     near = cKDTree(np.concatenate(images)).query_ball_point(positions, cutoff)
-    return {
-        (i, k % len(positions))
-        for i, pairs in enumerate(near)
-        for k in pairs
-        if i < k % len(positions)
-    }
+    pairs = ((i, k % len(positions)) for i, images in enumerate(near) for k in images)
+    return {(i, j) for i, j in pairs if i < j}
 
 
 def found_pairs(i, j):
@@ -130,10 +126,8 @@ def test_single_precision_misses_nothing_but_by_rounding():
     side, cutoff = flow_cell(count, 0.82)
     positions = random_positions(3, count, side, tilt).astype(np.float32)
     i, j, missed = search(positions, side, tilt, cutoff, PAIRS_PER_GRAIN * count)
-    found, images = (
-        found_pairs(i, j),
-        all_images(positions.astype(float), side, tilt, cutoff * (1 + 1e-4)),
-    )
+    found = found_pairs(i, j)
+    images = all_images(positions.astype(float), side, tilt, cutoff * (1 + 1e-4))
     assert not missed
     assert all_images(positions.astype(float), side, tilt, cutoff * (1 - 1e-6)) <= found <= images
 

@@ -48,9 +48,8 @@ def test_a_grid_of_replicas_has_the_bits_of_each_alone(flowing, threads: int) ->
                 jax.tree.map(lambda x, p=(k, n): x[p], grid),
                 one(restitution, fraction, flowing(fraction)),
             )
-            np.testing.assert_allclose(
-                tally.wave_kinetic, alone[1].wave_kinetic, rtol=1e-14
-            )  # XLA's cosine of a batch
+            # XLA's cosine of a batch
+            np.testing.assert_allclose(tally.wave_kinetic, alone[1].wave_kinetic, rtol=1e-14)
             rest = end, replace(tally, wave_kinetic=alone[1].wave_kinetic)
             jax.tree.map(np.testing.assert_array_equal, rest, alone)
 
@@ -75,7 +74,7 @@ def test_what_is_observed_in_a_batch_has_the_bits_of_each_replica_alone(
 
 
 def test_a_batch_without_replicas_is_empty(flowing) -> None:
-    _, tally = jax.vmap(advanced, (0, None, None))(jnp.zeros(0), 0.7, flowing(0.7))
+    _, tally = jax.jit(jax.vmap(advanced, (0, None, None)))(jnp.zeros(0), 0.7, flowing(0.7))
     assert tally.steps.shape == (0,)
 
 

@@ -72,11 +72,8 @@ def test_a_flow_stays_apart_conserves_momentum_and_balances_its_energy(packed_ow
     masses = np.where(EVEN, 3.0, 0.05)  # small and heavy, large and hollow
     velocities = rng.normal(size=(GRAINS, 2)) / np.sqrt(masses)[:, None]
     velocities -= masses @ velocities / masses.sum()
-    start = replace(
-        state,
-        grains=Grains(state.grains.radii, jnp.asarray(masses)),
-        velocities=jnp.asarray(velocities),
-    )
+    grains = Grains(state.grains.radii, jnp.asarray(masses))
+    start = replace(state, grains=grains, velocities=jnp.asarray(velocities))
     end, tally = run(flow_of(0.8, timestep=1e-4), start, 2000)
     gaps = gaps_of(end.positions, end.grains.radii, float(end.side), float(end.tilt))
     assert np.min(gaps) > -1e-2 and tally.collisions > 100
@@ -90,7 +87,7 @@ def test_a_flow_stays_apart_conserves_momentum_and_balances_its_energy(packed_ow
 
 def test_evenly_spaced_diameters_are_no_polydispersity() -> None:
     """The flow has the default one, which grains of one's own do not use."""
-    flow, grains = ShearFlow(16, 0.5, 0.6, 1e-3), own_grains(np.linspace(0.74, 1.26, 16))
+    flow, grains = flow_of(), own_grains(np.linspace(0.74, 1.26, GRAINS))
     state = prepare(flow, jax.random.key(0), equilibrate=0.1, grains=grains)
     assert sample(flow, state, 0.1)[1].pressure > 0
 

@@ -49,27 +49,21 @@ def test_two_discs_rebound_with_the_coefficient_of_restitution(engine_run, scene
     """At random phases, speeds, angles, sizes and offsets; the normal is that of the change."""
     rng = np.random.default_rng(int(10 * restitution))
     for _ in range(COLLISIONS):
-        radii, angle, offset = (
-            rng.uniform(0.37, 0.63, 2),
-            rng.uniform(0, 2 * np.pi),
-            rng.uniform(-0.8, 0.8),
-        )
-        along, across = (
-            np.array([np.cos(angle), np.sin(angle)]),
-            np.array([-np.sin(angle), np.cos(angle)]),
-        )
+        radii = rng.uniform(0.37, 0.63, 2)
+        angle = rng.uniform(0, 2 * np.pi)
+        offset = rng.uniform(-0.8, 0.8)
+        along = np.array([np.cos(angle), np.sin(angle)])
+        across = np.array([-np.sin(angle), np.cos(angle)])
         speed, timestep = rng.uniform(1, 10), 10 ** rng.uniform(-5, -3)
         reach = np.sum(radii)
         travel = rng.uniform(1, 3) * speed * timestep
         apart = along * (np.sqrt(1 - offset**2) * reach + travel) + across * offset * reach
         places, drift = 8 + np.array([apart, [0, 0]]), rng.normal(size=2)
         share = rng.uniform(0, 1)
-        before = scene(
-            places, [drift - share * speed * along, drift + (1 - share) * speed * along], radii
-        )
-        after, tally = engine_run(
-            flow_of(0.02, restitution=restitution, timestep=timestep), before, 8
-        )
+        meeting = [drift - share * speed * along, drift + (1 - share) * speed * along]
+        before = scene(places, meeting, radii)
+        flow = flow_of(0.02, restitution=restitution, timestep=timestep)
+        after, tally = engine_run(flow, before, 8)
         assert tally.collisions > 0
         kick = pair_velocity(after) - pair_velocity(before)
         normal = kick / np.linalg.norm(kick)
@@ -77,16 +71,9 @@ def test_two_discs_rebound_with_the_coefficient_of_restitution(engine_run, scene
         rebound = -(normal @ pair_velocity(after)) / (normal @ pair_velocity(before))
         assert rebound == pytest.approx(restitution, rel=0, abs=1e-10)
         masses = np.asarray(before.grains.masses)[:2]
-        lost = (
-            (1 - restitution**2)
-            / 2
-            * np.prod(masses)
-            / np.sum(masses)
-            * (normal @ pair_velocity(before)) ** 2
-        )
-        assert [tally.dissipation, tally.binary_dissipation] == pytest.approx(
-            [lost, lost], rel=1e-9, abs=1e-9
-        )
+        reduced, speed = np.prod(masses) / np.sum(masses), normal @ pair_velocity(before)
+        lost = pytest.approx((1 - restitution**2) / 2 * reduced * speed**2, rel=1e-9, abs=1e-9)
+        assert float(tally.dissipation) == lost and float(tally.binary_dissipation) == lost
         assert tally.status == Status.ok
 
 
@@ -112,10 +99,8 @@ def test_no_step_gains_energy_and_elastic_steps_keep_it(
     engine_run, flowing, packing_fraction, timestep, restitution
 ):
     """In the frame of the contacts: the fall of energy and the work of the shear on impulses."""
-    state, flow = (
-        flowing(packing_fraction),
-        flow_of(packing_fraction, restitution=restitution, timestep=timestep),
-    )
+    state = flowing(packing_fraction)
+    flow = flow_of(packing_fraction, restitution=restitution, timestep=timestep)
     lost, exchanged = [], []
     for _ in range(60):
         after, tally = engine_run(flow, state, 1)
@@ -243,11 +228,9 @@ def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit
 ):
     """Bagnold: rigid grains have no time scale but the shear's, so stresses go with its square."""
     steps = 500
-    state, flow, solver = (
-        flowing(packing_fraction),
-        flow_of(packing_fraction),
-        BarzilaiBorwein(max_steps=100_000),
-    )
+    state = flowing(packing_fraction)
+    flow = flow_of(packing_fraction)
+    solver = BarzilaiBorwein(max_steps=100_000)
     faster = replace(flow, shear_rate=2.0, timestep=flow.timestep / 2)
     slow, slow_tally = engine_run(flow, state, steps, solver)
     fast, fast_tally = engine_run(
@@ -294,7 +277,7 @@ def test_units_are_free(engines, flowing, mass, length, time) -> None:
 
 def test_a_flow_of_light_grains_is_prepared_as_any_other() -> None:
     """The predicted temperature, which begins it, is proportional to the masses."""
-    flow, diameters = ShearFlow(16, 0.7, 0.8, 1e-3), np.linspace(0.74, 1.26, 16)
+    flow, diameters = flow_of(0.8, restitution=0.7), np.linspace(0.74, 1.26, GRAINS)
     heavy, light = (
         prepare(flow, jax.random.key(0), 0.1, own_grains(diameters, masses=m * diameters**2))
         for m in (1.0, 2.0**-30)

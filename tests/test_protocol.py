@@ -87,9 +87,8 @@ def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch) -> None:
         Batch(flow, Numerics(), start, status, np.zeros(5), np.full(5, 3.2)), None
     )
     bad = Status.not_steady
-    np.testing.assert_array_equal(
-        end.status, [Status.ok, bad, Status.ok, bad, Status.nonfinite]
-    )  # the third only fluctuates
+    # the third only fluctuates
+    np.testing.assert_array_equal(end.status, [Status.ok, bad, Status.ok, bad, Status.nonfinite])
     strain = np.array(sheared)
     assert np.all(strain[:, 4] == 0)  # no work is done for a replica that is not finite
     np.testing.assert_allclose(end.strain, strain.sum(axis=0))
@@ -111,10 +110,8 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
     end = steady_state._shortened(
         Batch(coarse, Numerics(), state, np.zeros(2), np.zeros(2), np.ones(2)), flow, None
     )
-    timesteps, strains = (
-        np.array([dt for dt, _ in record]),
-        np.array([strain for _, strain in record]),
-    )
+    timesteps = np.array([dt for dt, _ in record])
+    strains = np.array([strain for _, strain in record])
     ladder = np.vstack([coarse.timestep, timesteps])
     np.testing.assert_allclose(ladder[1:, 0] / ladder[:-1, 0], 10**-0.5, rtol=1e-6)
     np.testing.assert_allclose(ladder[1:2, 1] / ladder[:1, 1], 0.2**0.5, rtol=1e-6)
@@ -185,9 +182,8 @@ def test_a_time_step_too_long_is_a_sentence_that_names_the_longest(
     assert one_sentence(message)
     assert f"restitution {max(alphas)} and packing fraction 0.4" in message  # the hotter of the two
     longest = float(re.search(r"at most ([\d.e+-]+) at", message)[1])
-    crossed = longest * np.sqrt(
-        2 * np.max(np.asarray(theory.granular_temperature))
-    )  # at thermal speed
+    # at thermal speed
+    crossed = longest * np.sqrt(2 * np.max(np.asarray(theory.granular_temperature)))
     assert 0.09 < crossed <= 0.1
     check_timestep(replace(flow, timestep=jnp.full(2, longest)), theory)
 

@@ -119,38 +119,23 @@ def test_callback_of_a_batch_is_told_of_all_replicas_which_are_those_of_their_ow
         assert_same((ends[k], together[k]), alone)
 
 
-MISTAKES = {
-    "flows and states of other numbers": (
-        lambda s: sample(FLOWS, s[:2], 0.1),
-        "one axis of replicas",
-    ),
-    "strains of another number": (lambda s: sample(FLOWS, s, np.ones(2)), "one axis of replicas"),
-    "no flow at all": (lambda s: sample(FLOWS[:0], s[:0], 0.1), "at least one replica"),
-    "two axes": (
-        lambda s: sample(jax.tree.map(lambda x: x[None], FLOWS), s, 0.1),
-        "one axis of replicas",
-    ),
-    "another packing fraction": (
-        lambda s: sample(replace(FLOWS, packing_fraction=0.6), s, 0.1),
-        "must be 0.5, which",
-    ),
-    "a strain below zero": (
-        lambda s: sample(FLOWS, s, np.array([0.1, 0.1, -1])),
-        "a positive number",
-    ),
-    "steps below zero": (
-        lambda s: jg.advance(FLOWS, s, np.array([1, 2, -1])),
-        "a whole number of 0 to",
-    ),
-    "one key": (lambda _: jg.prepare(FLOWS, KEYS[0]), "one for each key"),
-}
+TWO_AXES = jax.tree.map(lambda x: x[None], FLOWS)
+MISTAKES = [
+    ("one axis of replicas", lambda s: sample(FLOWS, s[:2], 0.1)),
+    ("one axis of replicas", lambda s: sample(FLOWS, s, np.ones(2))),
+    ("one axis of replicas", lambda s: sample(TWO_AXES, s, 0.1)),
+    ("at least one replica", lambda s: sample(FLOWS[:0], s[:0], 0.1)),
+    ("must be 0.5, which", lambda s: sample(replace(FLOWS, packing_fraction=0.6), s, 0.1)),
+    ("a positive number", lambda s: sample(FLOWS, s, np.array([0.1, 0.1, -1]))),
+    ("a whole number of 0 to", lambda s: jg.advance(FLOWS, s, np.array([1, 2, -1]))),
+    ("one for each key", lambda _: jg.prepare(FLOWS, KEYS[0])),
+]
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_batches_that_do_not_fit_are_refused_in_one_sentence(mistake: str, states: State) -> None:
-    function, words = MISTAKES[mistake]
+@pytest.mark.parametrize(("words", "call"), MISTAKES)
+def test_batches_that_do_not_fit_are_refused_in_one_sentence(words, call, states: State) -> None:
     with refused(words):
-        function(states)
+        call(states)
 
 
 def test_example_of_the_readme_runs_and_stands_in_the_help(capsys: pytest.CaptureFixture) -> None:

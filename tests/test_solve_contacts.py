@@ -132,26 +132,14 @@ def test_dense_and_sparse_matrices_are_the_same_problem():
     approach, count = network.approach, len(matrix)
     rows, columns = np.nonzero(matrix)
     split = np.concatenate([matrix[rows, columns] / 4, 3 * matrix[rows, columns] / 4, [np.pi]])
-    places = np.concatenate(
-        [np.stack([rows, columns], 1), np.stack([rows, columns], 1), [[count, count]]]
-    )
-    twice = BCOO(
-        (jnp.asarray(split), jnp.asarray(places)), shape=(count, count)
-    )  # in two parts, and padded
-    forms = (
-        matrix,
-        scipy.sparse.csr_array(matrix),
-        scipy.sparse.coo_matrix(matrix),
-        BCOO.fromdense(matrix),
-        twice,
-    )
-    first, *others = [
-        solve_contacts(
-            DelassusProblem(jnp.asarray(x) if x is matrix else x, approach),
-            solver=BarzilaiBorwein(1e-12),
-        )
-        for x in forms
-    ]
+    places = np.stack([rows, columns], 1)
+    places = np.concatenate([places, places, [[count, count]]])
+    # in two parts, and padded
+    twice = BCOO((jnp.asarray(split), jnp.asarray(places)), shape=(count, count))
+    of_scipy = scipy.sparse.csr_array(matrix), scipy.sparse.coo_matrix(matrix)
+    forms = jnp.asarray(matrix), *of_scipy, BCOO.fromdense(matrix), twice
+    problems = (DelassusProblem(form, approach) for form in forms)
+    first, *others = (solve_contacts(x, solver=BarzilaiBorwein(1e-12)) for x in problems)
     for other in others:
         assert other.status == Status.ok
         np.testing.assert_allclose(other.velocities, first.velocities, rtol=0, atol=1e-9)
@@ -224,9 +212,8 @@ def test_derivatives_of_a_network_are_those_of_finite_differences():
     }
     along = {name: random_like(value, 1) for name, value in at.items()}
     along["masses"] = along["masses"] * network.masses
-    along["normals"] = jnp.where(
-        network.normals != 0, along["normals"], 0
-    )  # unused slots stay unused
+    # unused slots stay unused
+    along["normals"] = jnp.where(network.normals != 0, along["normals"], 0)
     assert_derivatives(function, at, along)
 
 
@@ -271,22 +258,10 @@ def assert_derivatives(function, at, along, step=1e-6):
 
 def test_large_sparse_matrix_is_judged_and_solved_without_a_dense_copy():
     count = 5000
-    row = scipy.sparse.diags_array(
-        [np.full(count, 2.0), np.full(count - 1, -1.0), np.full(count - 1, -1.0)],
-        offsets=(0, 1, -1),
-    )
-    approach = np.zeros(count)
-    approach[0] = -1
-    solution = solve_contacts(
-        DelassusProblem(row, jnp.asarray(approach)), solver=BarzilaiBorwein(1e-6, 300)
-    )
+    beside = scipy.sparse.eye_array(count, k=1) + scipy.sparse.eye_array(count, k=-1)
+    row = 2.0 * scipy.sparse.eye_array(count) - beside
+    problem = DelassusProblem(row, jnp.zeros(count).at[0].set(-1.0))
+    solution = solve_contacts(problem, solver=BarzilaiBorwein(1e-6, 300))
     assert solution.residual < 0.1  # a shock that has come 300 discs far
     with pytest.raises(InputError, match="negative eigenvalue"):
-        solve_contacts(
-            DelassusProblem(
-                row
-                - 3.0 * scipy.sparse.eye_array(count, k=1)
-                - 3.0 * scipy.sparse.eye_array(count, k=-1),
-                jnp.asarray(approach),
-            )
-        )
+        solve_contacts(replace(problem, matrix=row - 3.0 * beside))

@@ -48,9 +48,8 @@ def test_delassus_operator_never_exceeds_its_bound(network_of, heaviest):
 @given(networks)
 def test_delassus_product_equals_the_dense_matrix(network_of):
     network, masses, _ = random_network(*network_of)
-    impulses = np.random.default_rng(network_of[0]).normal(
-        size=network.used.size
-    )  # unused slots too: they are inert
+    # unused slots too: they are inert
+    impulses = np.random.default_rng(network_of[0]).normal(size=network.used.size)
     matrix = delassus(network, masses)
     rounding = 16 * EPS * (np.abs(matrix) @ np.abs(impulses))
     operator = NetworkOperator(network, MAX_DISCS)
@@ -79,11 +78,9 @@ def test_impulses_push_and_are_complementary_to_the_velocities_after(
 ):
     network, masses, _ = random_network(*network_of)
     solution = solved(network, tolerance, method=method)
-    matrix, impulses, approach = (
-        delassus(network, masses),
-        np.asarray(solution.impulses),
-        np.asarray(network.approach),
-    )
+    matrix = delassus(network, masses)
+    impulses = np.asarray(solution.impulses)
+    approach = np.asarray(network.approach)
     assert solution.status == Status.ok
     assert np.all(impulses >= 0)
     rounding = 32 * EPS * np.linalg.norm(np.abs(matrix) @ impulses + np.abs(approach))
@@ -145,13 +142,8 @@ def test_cap_of_iterations_returns_the_best_iterate(solved, method):
 def squeezed(grains: int) -> Contacts:
     """A row closed through the boundary, all of whose contacts approach: nothing stops them."""
     i = np.arange(grains)
-    return padded_network(
-        i,
-        (i + 1) % grains,
-        np.tile([1.0, 0.0], (grains, 1)),
-        np.full(grains, -1.0),
-        np.ones(MAX_DISCS),
-    )
+    normals, approach = np.tile([1.0, 0.0], (grains, 1)), np.full(grains, -1.0)
+    return padded_network(i, (i + 1) % grains, normals, approach, np.ones(MAX_DISCS))
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -191,13 +183,9 @@ def test_compiled_solve_equals_the_interpreted_one(solved):
     """Some releases of JAX return wrong numbers from compiled code, silently."""
     network, _, _ = random_network(0, 12)
     compiled = solved(network, 1e-4, 8)
+    operator, solver = NetworkOperator(network, MAX_DISCS), BarzilaiBorwein(1e-4, 8)
     with jax.disable_jit():
-        interpreted = solve(
-            NetworkOperator(network, MAX_DISCS),
-            jnp.asarray(1.0),
-            BarzilaiBorwein(1e-4, 8),
-            jnp.asarray(True),
-        )
+        interpreted = solve(operator, jnp.asarray(1.0), solver, jnp.asarray(True))
     np.testing.assert_allclose(compiled.impulses, interpreted.impulses, rtol=0, atol=1e-12)
     np.testing.assert_allclose(compiled.residual, interpreted.residual, rtol=1e-10)
 

@@ -110,9 +110,8 @@ def test_interval_is_that_of_the_posterior_integrated_by_brute_force() -> None:
     x = ar1(np.random.default_rng(10), (2, 4), 0.5) + 3.0
     lag = np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
     half = 1.959964 * error_of_mean(x)
-    means = half * np.sinh(
-        np.linspace(-9, 9, 3601)
-    )  # less the plain mean; even in a scale that reaches far
+    # less the plain mean; even in a scale that reaches far
+    means = half * np.sinh(np.linspace(-9, 9, 3601))
     spacing = np.hypot(means, half)
     log_deviation = np.linspace(-4, 9, 131)[:, None]
     mass = np.zeros(means.size)
@@ -201,9 +200,8 @@ def test_error_of_values_that_differ_by_rounding_is_zero() -> None:
 
 def test_drift_of_a_step_is_its_height() -> None:
     assert drift(np.repeat([1.0, 3.5], 10)) == (2.5, 0.0)
-    assert (
-        drift(np.array([0.0, 0.0, 9.0, 1.0, 1.0]))[0] == 1.0
-    )  # the middle of an odd series is left out
+    # the middle of an odd series is left out
+    assert drift(np.array([0.0, 0.0, 9.0, 1.0, 1.0]))[0] == 1.0
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.6])

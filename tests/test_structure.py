@@ -46,9 +46,8 @@ def test_a_chain_of_three_and_a_pair() -> None:
 def test_shares_of_shear_stress_follow_the_directions_of_contacts() -> None:
     slanted = np.array([[1, 1], [1.6, 0.2], [2.2, -0.6], [5, 5], [5.6, 5.8]])
     share = cluster_share(snapshot_of(slanted[None], [[(0, 1, 1.0), (1, 2, 1.0), (3, 4, 0.5)]]))
-    np.testing.assert_allclose(
-        share.shear_stress.value, 2 / 1.5
-    )  # the pair is loaded the other way
+    # the pair is loaded the other way
+    np.testing.assert_allclose(share.shear_stress.value, 2 / 1.5)
     np.testing.assert_allclose(share.pressure.value, 2 / 2.5)
 
 

@@ -23,9 +23,8 @@ from jaxgran.sampling.thresholds import (
 )
 from jaxgran.statistics import drift
 
-OF_CHUNKS = float(
-    np.exp(-0.5)
-)  # correlation of neighbours a quarter of the correlation strain apart
+# correlation of neighbours a quarter of the correlation strain apart
+OF_CHUNKS = float(np.exp(-0.5))
 
 
 def noise(seed: int, count: int, length: int, correlation: float) -> np.ndarray:

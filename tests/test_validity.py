@@ -131,9 +131,7 @@ def test_arrays_broadcast_and_jit_vmap_give_the_same_numbers() -> None:
             np.testing.assert_allclose(np.broadcast_to(a, (2, 3)), b, rtol=VARIANCE_ROUNDING)
 
 
-@pytest.mark.parametrize(
-    "name", ["pressure", "shear_stress", "local_granular_temperature", "force_ratio"]
-)
+@pytest.mark.parametrize("name", ["local_granular_temperature", "force_ratio"])
 def test_gradients_are_those_of_finite_differences(name: str) -> None:
     def of(x):
         return jg.validity(x[0], x[1]).measured[name].value
@@ -141,9 +139,8 @@ def test_gradients_are_those_of_finite_differences(name: str) -> None:
     at, step = jnp.array([0.45, 0.71]), 1e-4
     exact = jax.grad(of)(at)
     by_steps = [(of(at + step * axis) - of(at - step * axis)) / (2 * step) for axis in np.eye(2)]
-    np.testing.assert_allclose(
-        exact, by_steps, rtol=1e-5
-    )  # truncation of step² over the range of the map squared
+    # truncation of step² over the range of the map squared
+    np.testing.assert_allclose(exact, by_steps, rtol=1e-5)
 
 
 def test_outside_the_range_is_refused_or_nan_where_jax_traces_it() -> None:

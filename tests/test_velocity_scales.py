@@ -129,10 +129,8 @@ def test_readings_of_both_engines_are_taken_in_the_same_steps(packed, engines):
     """Past one reading within the advance, in a dense and slowly sheared flow; with the tilt of
     another time the waves differ by 0.3 %.
     """
-    rng, flow = (
-        np.random.default_rng(0),
-        flow_of(0.7, restitution=1.0, timestep=2e-3, shear_rate=0.1),
-    )
+    rng = np.random.default_rng(0)
+    flow = flow_of(0.7, restitution=1.0, timestep=2e-3, shear_rate=0.1)
     state = replace(packed(0.7), velocities=jnp.asarray(rng.normal(size=(GRAINS, 2))))
     (_, numba), (end, plain) = (engines[name](flow, state, 1500) for name in ("numba", "jax"))
     assert numba.collisions == plain.collisions > READ_AFTER * GRAINS / 2
