@@ -101,11 +101,8 @@ def test_errors_of_the_committed_chart_of_whole_runs_are_within_the_bound_and_it
             bound = stress_error(crossing, flow["packing_fraction"], flow["discs"])
             for name in ("pressure", "shear_stress"):
                 error, noise = row["errors"][name]
-                assert abs(error) < bound + 3 * noise + 0.01, (
-                    flow["packing_fraction"],
-                    row["setting"],
-                    name,
-                )
+                where = flow["packing_fraction"], row["setting"], name
+                assert abs(error) < bound + 3 * noise + 0.01, where
     assert compared > 2 * len(chart["flows"])
 
 

@@ -51,15 +51,9 @@ class Lab:
         command = [sys.executable, str(DRIVER), *MAP, "--workers", "2", "--output", output, *words]
         environment = os.environ | {"FAULT": fault}
         environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # which JAX has set in this process
-        return subprocess.Popen(
-            command,
-            cwd=self.folder,
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        own = {"cwd": self.folder, "env": environment, "start_new_session": True}
+        return subprocess.Popen(command, **own, **pipes)
 
     def finish(self, process: subprocess.Popen) -> subprocess.CompletedProcess:
         out, err = process.communicate(timeout=PATIENCE)

@@ -131,9 +131,7 @@ def rate_in_flight(state, points, width):
     """∂/∂t of the densities in free flight."""
     now, unit = jnp.asarray(0.0), jnp.asarray(1.0)
     return jax.jvp(
-        lambda time: densities_of(free_flight(state, 1.0, time), points, width),
-        (now,),
-        (unit,),
+        lambda time: densities_of(free_flight(state, 1.0, time), points, width), (now,), (unit,)
     )[1]
 
 

@@ -19,13 +19,7 @@ from jaxgran.model.choices import MAX_PACKING_FRACTION, MIN_GRAINS
 from jaxgran.model.flow import ShearFlow, require_sheared, steps_of_strain
 
 FLOW = ShearFlow(grains=64, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
-NUMBERS = (
-    "restitution",
-    "packing_fraction",
-    "timestep",
-    "shear_rate",
-    "polydispersity",
-)
+NUMBERS = ("restitution", "packing_fraction", "timestep", "shear_rate", "polydispersity")
 
 
 def refusal(**change) -> str:

@@ -353,13 +353,9 @@ def test_bound_of_closing_includes_that_speeds_grow_within_a_flight(engine, spee
     if engine == "numba":
         bound = closing_speed_bound.py_func(speed, 1.0, 1 + skin, LOOK_AHEAD)
     else:
-        grains = Grains(jnp.full(2, 0.5), jnp.ones(2))
-        bound = step.closing_speed_bound(
-            ShearFlow(32, 0.5, 0.5, 2 * LOOK_AHEAD),
-            grains,
-            jnp.asarray(velocities),
-            jnp.asarray(skin),
-        )
+        flow, grains = flow_of(timestep=2 * LOOK_AHEAD), Grains(jnp.full(2, 0.5), jnp.ones(2))
+        given = jnp.asarray(velocities), jnp.asarray(skin)
+        bound = step.closing_speed_bound(flow, grains, *given)
     assert closing <= bound <= closing + 2 * speed * longest
 
 

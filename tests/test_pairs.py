@@ -102,12 +102,8 @@ def test_pairs_left_out_are_flagged(packed, monkeypatch, buffer):
     state, flags = packed(0.7), []
     monkeypatch.setattr(near_pairs, buffer, 2)
     tiny = jax.jit(lambda *arguments: pair_lists(*arguments))
-    for seed in range(6):
-        places = (
-            state.positions
-            if seed == 0
-            else clustered(len(state.positions), float(state.side), seed)
-        )
+    heaps = [clustered(len(state.positions), float(state.side), seed) for seed in range(1, 6)]
+    for places in (state.positions, *heaps):
         hood = tiny(places, state.grains, state.side, state.tilt)
         touch = pairs_within(0, places, state.grains.radii, state.side, state.tilt)
         flags.append(bool(hood.near.overflow) or float(hood.near.skin) < 0)

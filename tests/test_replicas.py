@@ -132,7 +132,7 @@ MISTAKES = [
 ]
 
 
-@pytest.mark.parametrize(("words", "call"), MISTAKES)
+@pytest.mark.parametrize(("words", "call"), MISTAKES, ids=range(len(MISTAKES)))
 def test_batches_that_do_not_fit_are_refused_in_one_sentence(words, call, states: State) -> None:
     with refused(words):
         call(states)
@@ -148,20 +148,14 @@ def test_example_of_the_readme_runs_and_stands_in_the_help(capsys: pytest.Captur
     )
     assert len(batch) == 2 and batch == in_tutorial
     exec(example, {})
-    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    printed, shown = (
-        np.array(
-            [
-                re.findall(r"\d+\.\d+|nan", line)
-                for line in re.findall("^α = .*: .* ± .*", text, re.MULTILINE)
-            ],
-            float,
-        )
-        for text in (capsys.readouterr().out, readme)
-    )
+
+    def numbers(text: str) -> np.ndarray:
+        lines = re.findall("^α = .*: .* ± .*", text, re.MULTILINE)
+        return np.array([re.findall(r"\d+\.\d+|nan", line) for line in lines], float)
+
+    shown = numbers((Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8"))
+    printed = numbers(capsys.readouterr().out)
     assert printed.shape == (4, 4)
     np.testing.assert_array_equal(printed[:, :2], shown[:, :2])
-    assert np.all(
-        abs(printed[:, 2] - shown[:, 2])
-        <= 4 * np.hypot(np.nan_to_num(printed[:, 3]), shown[:, 3]) + 1e-3
-    )
+    errors = np.hypot(np.nan_to_num(printed[:, 3]), shown[:, 3])
+    assert np.all(abs(printed[:, 2] - shown[:, 2]) <= 4 * errors + 1e-3)

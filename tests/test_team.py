@@ -95,23 +95,14 @@ def found_by_races(tmp_path: Path, without: str = "") -> tuple[int, list[str], n
     flow, state = flow_and_state(0.5, 0.75, grains=24)
     file = tmp_path / "state.npz"
     inputs = [state.side, flow.restitution, flow.timestep, 1.0, 1e-10, flow.activation, 1000]
-    np.savez(
-        file,
-        positions=state.positions,
-        velocities=state.velocities,
-        radii=state.grains.radii,
-        masses=state.grains.masses,
-        steps=np.array([15.0, 15.0]),
-        inputs=np.array(inputs, float),
-        begin=first_row(flow, state),
-    )
-    script = Path(__file__).with_name("team_races.py")
+    arrays = {name: getattr(state, name) for name in ("positions", "velocities")}
+    arrays |= {name: getattr(state.grains, name) for name in ("radii", "masses")}
+    arrays |= {"steps": np.array([15.0, 15.0]), "inputs": np.array(inputs, float)}
+    np.savez(file, **arrays, begin=first_row(flow, state))
+    script, plain = Path(__file__).with_name("team_races.py"), {"NUMBA_DISABLE_JIT": "1"}
+    command = [sys.executable, str(script), str(file), "4", without]
     run = subprocess.run(
-        [sys.executable, str(script), str(file), "4", without],
-        env=os.environ | {"NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
+        command, env=os.environ | plain, capture_output=True, text=True, timeout=300
     )
     barriers, *wrong = run.stdout.splitlines()
     expected = by_numba(flow, state, steps=np.array([15, 15])).positions

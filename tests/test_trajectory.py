@@ -205,22 +205,16 @@ def test_a_replica_that_is_not_finite_has_no_frames(flow, flowing, drive, tmp_pa
 
 
 def test_frames_are_at_the_nearest_time_steps_of_any_strain(flow, flowing, drive) -> None:
-    steps: list[int] = []
-    recorder = Recorder(0.01037, lambda _, step: steps.append(step))
-    driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (25, 15, 60))
-    assert steps == [round(10.37 * k) for k in range(10)]
-    steps.clear()
-    driven_in_blocks(
-        Recorder(1e-5, lambda _, step: steps.append(step)).recording(drive),
-        flow,
-        flowing(0.78),
-        (3, 2),
-    )
-    assert steps == [0, 1, 2, 3, 4, 5]
-    steps.clear()
-    few = Recorder(0.01, lambda _, step: steps.append(step), most=3)
-    driven_in_blocks(few.recording(drive), flow, flowing(0.78), (25, 15, 60))
-    assert steps == [0, 10, 20] and few.frames == 3 and few.steps == 100
+    def recorded_steps(every: float, blocks: tuple[int, ...], **options) -> list[int]:
+        steps: list[int] = []
+        recorder = Recorder(every, lambda _, step: steps.append(step), **options)
+        driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), blocks)
+        assert (recorder.frames, recorder.steps) == (len(steps), sum(blocks))
+        return steps
+
+    assert recorded_steps(0.01037, (25, 15, 60)) == [round(10.37 * k) for k in range(10)]
+    assert recorded_steps(1e-5, (3, 2)) == [0, 1, 2, 3, 4, 5]
+    assert recorded_steps(0.01, (25, 15, 60), most=3) == [0, 10, 20]
 
 
 def mean_forces(flow, run, state, steps: int) -> dict[tuple[int, int], float]:
