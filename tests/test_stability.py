@@ -24,7 +24,7 @@ def test_dense_flow_converges_or_is_flagged(packing_fraction: float) -> None:
     state = stability.start(case, seed=0)
     before = float(np.sum(state.grains.masses[:, None] * state.velocities**2) / 2)
     flow = stability.flow_of(case, 3e-4)
-    state, tally = stability.advance(flow, state, jnp.int32(100), solver=solver)
+    state, tally = stability.advance(flow, state, jnp.int32(300), solver=solver)
     finite = all(np.isfinite(x).all() for x in jax.tree.leaves((state, tally)))
     status = Status(int(tally.status))
     assert finite or status == Status.nonfinite
