@@ -93,6 +93,14 @@ class Output:
         self.folder.mkdir(parents=True, exist_ok=True)
         return self.folder / f"{name}{'_quick' if self.quick else ''}{ending}"
 
+    def unfinished(self, name: str) -> Path | None:
+        """The folder that keeps what is done of a long result, that of the commit; None for a quick
+        run and from a changed tree.
+        """
+        commit = str(self.hardware["commit"])
+        kept = not self.quick and not commit.endswith("-dirty")
+        return self.path(f".unfinished-{name}-{commit}", "") if kept else None
+
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write a result below the hardware, to which the content may add: rows one to a line, in
         which what is not a number is null.

@@ -41,7 +41,7 @@ def run(output: Output, part: Literal["random", "large"] = "random") -> None:
         flows = [(*flow, plan["grains"], FIRST_SEED) for flow in LARGE_FLOWS]
         options = {x: plan[x] for x in ("equilibrate", "strain")}
     measured = partial(row_of, options | {"timestep": plan["timestep"]})
-    rows = on_all_cores(measured, flows, lambda flow: -flows.index(flow))
+    rows = on_all_cores(measured, flows, lambda flow: -flows.index(flow), output.unfinished(name))
     output.write_json(name, {**plan, "first_seed": FIRST_SEED} | {"rows": rows})
 
 

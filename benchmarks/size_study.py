@@ -60,7 +60,8 @@ QUICK = Plan(((0.5, 0.6, 256), (0.8, 0.2, 256)), {64: 2, 256: 1})
 def run(output: Output) -> None:
     """Measure all flows, and write ``size_study`` as JSON, and figures of values and waves."""
     plan = QUICK if output.quick else FULL
-    flows = on_all_cores(partial(rows_of_flow, plan), plan.flows, lambda flow: flow[2])
+    kept = output.unfinished("size_study")
+    flows = on_all_cores(partial(rows_of_flow, plan), plan.flows, lambda flow: flow[2], kept)
     rows = [row for some in flows for row in some]
     head = {"sampled_memories": SAMPLED, "blocks": BLOCKS, "timestep": TIMESTEP}
     output.write_json("size_study", head | {"flows": rows})

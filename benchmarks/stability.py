@@ -125,9 +125,14 @@ class Failure(Exception):
 
 
 def run(output: Output) -> None:
-    """Measure all flows on all cores, print what is found, and write JSON and PNG."""
+    """Measure all flows on all cores, print what is found, and write JSON and PNG.
+
+    Flows that are done are kept for a second run of the same commit.
+    """
     plan = QUICK if output.quick else FULL
-    results = on_all_cores(partial(rows_of, plan), plan.cases, lambda case: case.packing_fraction)
+    kept = output.unfinished("stability")
+    measure = partial(rows_of, plan)
+    results = on_all_cores(measure, plan.cases, lambda case: case.packing_fraction, kept)
     rows = [row for _, some in results for row in some]
     head = {"seeds": plan.seeds, "right": RIGHT, "precision": PRECISION, "seconds": SECONDS}
     head |= {"references": [reference for reference, _ in results]}
@@ -292,15 +297,22 @@ def start(case: Case, seed: int) -> jg.State:
 class ContactDynamics:
     """A run of jaxgran in some way, like ``problem.Run``, with the sums of all that it sampled."""
 
-    def __init__(self, case: Case, state: jg.State, timestep: float, **numerics: Any) -> None:
-        dtype, solver = numerics.get("dtype", "float64"), numerics.get("solver")
+    def __init__(
+        self,
+        case: Case,
+        state: jg.State,
+        timestep: float,
+        dtype: str = "float64",
+        solver: jg.ProjectedMethod | None = None,
+        engine: Any = None,
+    ) -> None:
         self.case, self.flow = case, flow_of(case, timestep, dtype)
         self.state = jax.tree.map(lambda x: x.astype(dtype), state)
         self.solver = jax.tree.map(
             lambda x: jnp.asarray(x, "int32" if isinstance(x, int) else dtype),
             solver or jg.BarzilaiBorwein(),
         )
-        self.engine = numerics.get("engine")
+        self.engine = engine
         self.steps = round(case.block / timestep)
         self.tally: jg.Tally | None = None
 

@@ -1,7 +1,9 @@
 """One command runs all benchmarks, their results are used, and charts judge rightly."""
 
 import inspect
+import math
 import subprocess
+from functools import partial
 from importlib import import_module
 from itertools import product
 from pathlib import Path
@@ -13,6 +15,7 @@ from matplotlib.text import Text
 
 from benchmarks import output
 from benchmarks.__main__ import benchmarks, parser_of
+from benchmarks.cores import on_all_cores
 from benchmarks.draw import PICTURES
 from benchmarks.peers import front
 from benchmarks.reference_map import BETWEEN, DENSER, PLANE, reference_points
@@ -50,6 +53,21 @@ def test_a_benchmark_says_its_command_and_its_options_can_be_given(name: str) ->
     shared = {"quick": True, "output": ANY, "replace": False}
     given = vars(parser_of(name, module).parse_args(["--quick"]))
     assert given == {x.name: x.default if x.default is False else None for x in parameters} | shared
+
+
+def root_of(folder: Path, number: int) -> float:
+    """A task that notes its name, and fails for a negative number."""
+    (folder / f"{number}.called").touch(exist_ok=False)
+    return math.sqrt(number)
+
+
+def test_a_long_benchmark_that_was_stopped_goes_on_with_what_is_missing(tmp_path: Path) -> None:
+    kept, task = tmp_path / "kept", partial(root_of, tmp_path)
+    with pytest.raises(ValueError, match="math domain error|nonnegative"):
+        on_all_cores(task, [4, -1], lambda number: number, kept)
+    (tmp_path / "-1.called").unlink()
+    assert on_all_cores(task, [9, 4], lambda number: number, kept) == [3, 2]  # 4 not once more
+    assert not kept.exists()
 
 
 @pytest.mark.parametrize("name", PICTURES)
