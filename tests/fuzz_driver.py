@@ -60,8 +60,6 @@ def advanced(numbers: dict) -> tuple:
     return advance_replica(flow, state, jnp.asarray([STEPS // 3] * 3, jnp.int32), numerics)
 
 
-# Out of its array an index of machine code reads anything, and one of JAX is clamped
-@settings(max_examples=500 if sys.argv[1] == "numba" else 100, database=None)
 @given(speed=FINITE, timestep=st.sampled_from([1e-6, 1e-3, 0.1]), changes=CHANGES)
 def finite_or_flagged(speed, timestep, changes) -> None:
     numbers = {name: np.array(values, float) for name, values in GIVEN.items()}
@@ -75,4 +73,6 @@ def finite_or_flagged(speed, timestep, changes) -> None:
 
 
 if __name__ == "__main__":
-    finite_or_flagged()
+    # Out of its array an index of machine code reads anything, and one of JAX is clamped
+    examples = 500 if sys.argv[1] == "numba" else 100
+    settings(max_examples=examples, database=None)(finite_or_flagged)()

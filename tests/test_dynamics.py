@@ -13,8 +13,6 @@ from oracles import gaps_of
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi
 from jaxgran.dynamics import jax_engine
-from jaxgran.dynamics.advance import advance
-from jaxgran.dynamics.engine import Jax, Numba
 from jaxgran.dynamics.jax_engine import advance_by_jax, contact_buffers
 from jaxgran.dynamics.snapshots import contacts_now
 from jaxgran.dynamics.tally import TABLE
@@ -158,16 +156,6 @@ def test_state_that_is_not_finite_stops_at_once(engine_run, flowing, field, bad)
     _, tally = engine_run(flow_of(), spoilt, 2_000_000_000)
     assert tally.status == Status.nonfinite
     assert tally.steps == 0
-
-
-@pytest.mark.parametrize("bad", [{"restitution": -0.05}, {"restitution": 1.1}, {"activation": 0.2}])
-def test_a_traced_number_that_a_flow_refuses_ends_it_at_once(engine, flowing, bad):
-    def status(number):
-        changed = replace(flow_of(0.6), **dict.fromkeys(bad, number))
-        engine_of = {"numba": Numba(), "jax": Jax()}[engine]
-        return advance(changed, flowing(0.6), jnp.int32(10), engine=engine_of)[1].status
-
-    assert jax.jit(status)(*bad.values()) == Status.nonfinite
 
 
 def equations_of(jaxpr) -> list:

@@ -67,18 +67,20 @@ def inputs(network: Contacts, masses: np.ndarray):
     return network.approach, angles, jnp.asarray(1 / masses)
 
 
-def strictness(network: Contacts, masses: np.ndarray) -> float:
+def strictness_and_error(network: Contacts, masses: np.ndarray) -> tuple[float, np.ndarray]:
     """How far the network is from a contact that neither presses nor parts, or, if that is less,
     from impulses that are not unique: the smallest eigenvalue of the block of pressing contacts.
+    And by how much the impulses are off.
     """
-    impulses = np.asarray(impulses_of(*inputs(network, masses), network))
-    matrix = delassus(network, masses)
-    margin = np.maximum(
-        np.diag(matrix) * impulses, matrix @ impulses + np.asarray(network.approach)
-    )
-    presses = (impulses > 0) & np.asarray(network.used)
-    eigenvalues = np.linalg.eigvalsh(matrix[np.ix_(presses, presses)])
-    return float(np.min(np.append(margin[np.asarray(network.used)], eigenvalues)))
+    impulses, used = np.asarray(impulses_of(*inputs(network, masses), network)), network.used
+    matrix, approach = delassus(network, masses), np.asarray(network.approach)
+    margin = np.maximum(np.diag(matrix) * impulses, matrix @ impulses + approach)
+    presses = (impulses > 0) & np.asarray(used)
+    block, error = matrix[np.ix_(presses, presses)], np.zeros(impulses.size)
+    strict = float(np.min(np.append(margin[np.asarray(used)], np.linalg.eigvalsh(block))))
+    if strict > 0:
+        error[presses] = impulses[presses] + np.linalg.solve(block, approach[presses])
+    return strict, error
 
 
 @settings(max_examples=25, phases=[Phase.generate])
@@ -86,10 +88,13 @@ def strictness(network: Contacts, masses: np.ndarray) -> float:
 def test_gradient_of_a_solve_is_that_of_finite_differences(network_of, heaviest):
     """By velocities, geometry and masses, wherever no contact is about to press or to part."""
     network, masses, _ = random_network(*network_of, heaviest)
-    assume(np.any(network.used) and strictness(network, masses) > 1e-3)
     used = np.asarray(network.used)
+    assume(np.any(used))
+    strict, error = strictness_and_error(network, masses)
+    assume(strict > 1e-3)
     rng = np.random.default_rng(network_of[0])
     at, weights = inputs(network, masses), jnp.asarray(rng.normal(size=used.size) * used)
+    noise = 4 * float(jnp.linalg.norm(weights * error)) / 1e-5  # of the differences
     derivative = gradient(*at, network, weights)
     assert all(np.all(np.isfinite(part)) for part in derivative)
     assume(float(jnp.max(jnp.abs(derivative[0]))) < 1e3)  # else differences lose their digits
@@ -112,7 +117,7 @@ def test_gradient_of_a_solve_is_that_of_finite_differences(network_of, heaviest)
         numerical = (4 * difference(1e-5) - difference(2e-5)) / 3  # of fourth order
         exact = float(jnp.sum(derivative[k] * along[k]))
         scale = float(jnp.sqrt(jnp.sum(derivative[k] ** 2))) + 1
-        assert abs(numerical - exact) < 1e-6 * scale
+        assert abs(numerical - exact) < 1e-6 * scale + noise
         assert abs(tangent(at, along, network, weights) - exact) < 1e-8 * scale
 
 
