@@ -207,6 +207,20 @@ def test_a_sample_below_four_correlation_strains_says_so_however_it_is_taken(sta
     assert long.status == Status.ok and _sample._cache_size() == compiled
 
 
+def test_another_block_of_a_callback_compiles_nothing(state) -> None:
+    compiled, counts = [], []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, *_, **__: compiled.append(name)
+    )
+
+    def count(_: State, so_far: Sample) -> None:
+        assert so_far.pressure > 0
+        counts.append(sum(name.endswith("backend_compile_duration") for name in compiled))
+
+    sample(FLOWS[0], state, 0.32, 6, callback=count)
+    assert 0 < counts[0] == counts[-1] and len(counts) == 6
+
+
 def test_spread_of_the_largest_of_one_block_is_unknown() -> None:
     block = sample_of_tally(random_tally(np.random.default_rng(2), 1), FLOWS[0])
     assert np.isnan(block.errors()["max_overlap"]) and np.isnan(block.errors()["pressure"])

@@ -189,21 +189,24 @@ def _sample_with_callback(
     flow, start, strain = batch
     engine = select_engine(numerics, start).name
 
-    def result(end: State, tallies: Sequence[Tally]) -> tuple[State, Sample]:
+    def so_far(end: State, tallies: Sequence[Tally]) -> tuple[State, Sample]:
+        """The sample in NumPy, as JAX would compile its part for each number of blocks."""
         measured = _with_length(replace(sample_of_blocks(flow, end, tallies), engine=engine))
-        return jax.tree.map(lambda x: jnp.asarray(x[0] if single else x), (end, measured))
+        state, measured = jax.tree.map(lambda x: x[0] if single else x, (end, measured))
+        return jax.tree.map(jnp.asarray, state), measured
 
     advance = partial(advance_batch, observe=observe, threads=usable_threads())
-    return result(
-        *advance_by_block(
-            advance,
-            (flow, numerics, start),
-            strain,
-            blocks,
-            np.zeros(np.shape(start.side), bool),
-            stop=lambda *so_far: callback(*result(*so_far)),
-        )
+    given_up = np.zeros(np.shape(start.side), bool)
+    ended = advance_by_block(
+        advance,
+        (flow, numerics, start),
+        strain,
+        blocks,
+        given_up,
+        stop=lambda *done: callback(*so_far(*done)),
     )
+    state, measured = so_far(*ended)
+    return state, jax.tree.map(jnp.asarray, measured)
 
 
 def _with_length(measured: Sample) -> Sample:
@@ -211,6 +214,9 @@ def _with_length(measured: Sample) -> Sample:
     ``correlation_strain``.
     """
     of_length = length_status(measured.strain, measured.correlation_strain)
-    status = jnp.asarray(measured.tally.status)
-    worst = jnp.maximum(status[..., -1], jnp.asarray(of_length, status.dtype))
-    return replace(measured, tally=replace(measured.tally, status=status.at[..., -1].set(worst)))
+    status = measured.tally.status
+    xp = jnp if isinstance(status, jax.Array) else np
+    worst = xp.maximum(status, xp.asarray(of_length, status.dtype)[..., None])
+    is_last = xp.arange(status.shape[-1]) == status.shape[-1] - 1
+    tally = replace(measured.tally, status=xp.where(is_last, worst, status))
+    return replace(measured, tally=tally)
