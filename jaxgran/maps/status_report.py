@@ -61,7 +61,7 @@ def short_samples_message(data: MapData, points: list[str]) -> str:
     which = "" if data.status.size == 1 else f" at {_some(points)}"
     return (
         f"short sample{which}: less than {FEWEST_CORRELATION_STRAINS:g} correlation strains, so "
-        f"its errors may be too small; set `strain={math.ceil(enough)}`."
+        f"its errors may be too small: it needs `strain={math.ceil(enough)}`."
     )
 
 
