@@ -2,7 +2,6 @@
 
 import json
 import multiprocessing
-import shutil
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -22,15 +21,17 @@ def on_all_cores(
 ) -> list[Any]:
     """What is measured of each task, in their order; the dearest begin first.
 
-    A folder keeps the answers as JSON until all are there, so that a run that was stopped goes on.
+    A folder keeps the answers as JSON, so that a run that was stopped goes on, see
+    ``Output.unfinished``.
     """
     with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
         dear_first = sorted(tasks, key=cost, reverse=True)
         done = {task: pool.submit(_answer, measured, task, folder) for task in dear_first}
-        answers = [done[task].result() for task in tasks]
-    if folder is not None:
-        shutil.rmtree(folder)
-    return answers
+        try:
+            return [done[task].result() for task in tasks]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def _answer(measured: Callable[[Task], Any], task: Task, folder: Path | None) -> Any:

@@ -5,9 +5,12 @@ without changes.
 import json
 import os
 import platform
+import shutil
 import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +42,14 @@ def rounded(value: Any, digits: int) -> Any:
     if isinstance(value, list):
         return [rounded(x, digits) for x in value]
     return float(f"{value:.{digits}g}") if isinstance(value, float) else value
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _without_nan(x) for name, x in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(x) for x in value]
+    return None if isinstance(value, float) and value != value else value
 
 
 def refusal(quick: bool) -> str | None:
@@ -94,26 +105,27 @@ class Output:
         return self.folder / f"{name}{'_quick' if self.quick else ''}{ending}"
 
     def unfinished(self, name: str) -> Path | None:
-        """The folder that keeps what is done of a long result, that of the commit; None for a quick
-        run and from a changed tree.
+        """The folder that keeps what is done of a long result on this hardware, until the result is
+        written; None for a quick run and from a changed tree.
         """
-        commit = str(self.hardware["commit"])
-        kept = not self.quick and not commit.endswith("-dirty")
-        return self.path(f".unfinished-{name}-{commit}", "") if kept else None
+        kept = not self.quick and not str(self.hardware["commit"]).endswith("-dirty")
+        measured_with = sha256(json.dumps(self.hardware).encode()).hexdigest()[:16]
+        return self.path(f".unfinished-{name}-{measured_with}", "") if kept else None
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write a result below the hardware, to which the content may add: rows one to a line, in
-        which what is not a number is null.
+        """Write a result below the hardware, to which the content may add: rows one to a line; what
+        is not a number is null.
         """
-        parts = []
-        for key, value in {"hardware": self.hardware, **content}.items():
-            text = json.dumps(value, indent=1, ensure_ascii=False).replace("\n", "\n ")
+        dumps, parts = partial(json.dumps, ensure_ascii=False, allow_nan=False), []
+        for key, value in _without_nan({"hardware": self.hardware, **content}).items():
+            text = dumps(value, indent=1).replace("\n", "\n ")
             if isinstance(value, list) and value and isinstance(value[0], dict):
-                rows = ({k: None if x != x else x for k, x in row.items()} for row in value)
-                lines = (json.dumps(row, ensure_ascii=False) for row in rows)
-                text = "[\n  " + ",\n  ".join(lines) + "\n ]"
+                text = "[\n  " + ",\n  ".join(map(dumps, value)) + "\n ]"
             parts.append(f' "{key}": {text}')
-        self.path(name, ".json").write_text("{\n" + ",\n".join(parts) + "\n}\n")
+        file, unfinished = self.path(name, ".json"), self.unfinished(name)
+        file.write_text("{\n" + ",\n".join(parts) + "\n}\n", "utf-8")
+        if unfinished is not None:
+            shutil.rmtree(unfinished, ignore_errors=True)
 
     def write_picture(self, figure: Figure, name: str, ending: str = ".png") -> None:
         """Write a figure as PNG."""

@@ -1,6 +1,7 @@
 """One command runs all benchmarks, their results are used, and charts judge rightly."""
 
 import inspect
+import json
 import math
 import subprocess
 from functools import partial
@@ -67,7 +68,26 @@ def test_a_long_benchmark_that_was_stopped_goes_on_with_what_is_missing(tmp_path
         on_all_cores(task, [4, -1], lambda number: number, kept)
     (tmp_path / "-1.called").unlink()
     assert on_all_cores(task, [9, 4], lambda number: number, kept) == [3, 2]  # 4 not once more
-    assert not kept.exists()
+
+
+def test_what_is_kept_of_a_result_is_that_of_its_hardware_until_it_is_written(
+    tmp_path: Path,
+) -> None:
+    """And what is not a number is null, anywhere."""
+    one, other = (
+        output.Output(tmp_path, False, {"processor": x, "commit": "1"}) for x in ("one", "other")
+    )
+    folders = [x.unfinished("study") for x in (one, other)]
+    for folder in folders:
+        assert folder is not None
+        folder.mkdir()
+    rows = [{"α": np.nan, "pair": (1.0, np.nan)}]
+    one.write_json("study", {"mean": {"x": np.nan}, "rows": rows})
+    assert [x.exists() for x in folders if x] == [False, True]
+    content = json.loads((tmp_path / "study.json").read_text("utf-8"))
+    assert content["mean"] == {"x": None} and content["rows"] == [{"α": None, "pair": [1.0, None]}]
+    changed = output.Output(tmp_path, False, {"commit": "1-dirty"})
+    assert changed.unfinished("study") is None
 
 
 @pytest.mark.parametrize("name", PICTURES)

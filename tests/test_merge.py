@@ -52,7 +52,7 @@ def of_seeds(
 ) -> xr.DataTree:
     """The map of some of the seeds, of which one is made for all tests."""
     settings = replace(SETTINGS, first_seed=first, seeds=count, **change)
-    key = (settings, len(replicas))
+    key = (settings, tuple(replicas))
     if key not in MADE:
         own = replica_ids(settings)
         MADE[key] = map_dataset(settings, [x for x in replicas.values() if x.id in own], RUN)

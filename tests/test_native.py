@@ -297,7 +297,7 @@ def test_a_traced_number_that_cannot_be_ends_its_replica_and_no_other(engine) ->
         *((name, np.nan) for name in ("tilt", "restitution", "positions", *cannot_be)),
         *((name, np.inf) for name in ("tilt", "restitution", "velocities", *cannot_be)),
         *cannot_be.items(),
-        *(("restitution", alpha) for alpha in (-0.05, 1.1)),
+        *(("restitution", -0.05), ("restitution", 1.1), ("activation", 0.3)),
     ]
     replicas = [{name: np.array(x, float) for name, x in GIVEN.items()} for _ in (*faults, 0, 1)]
     for changed, (name, value) in zip(replicas[1:-1], faults, strict=True):

@@ -108,8 +108,10 @@ def measured_over_enskog(
 
 
 def _require_uniform(flow: ShearFlow, sample: Sample) -> None:
-    """Raise an InputError if the mean d² or the mean mass is not that of ``polydisperse`` discs."""
-    uniform = 1 + flow.polydispersity**2 * (1 - flow.grains**-2) / 3
+    """Raise an InputError if the mean d² or the mean mass is not within 1e-3 that of
+    ``polydisperse`` discs.
+    """
+    uniform = 1 + flow.polydispersity**2 * (1 - 1 / flow.grains**2) / 3
     mass = mass_of_grains(flow.packing_fraction, sample.area)
     if not np.allclose([mass, sample.mass], flow.grains * uniform, rtol=1e-3):
         raise InputError(

@@ -190,7 +190,7 @@ def _sample_with_callback(
     engine = select_engine(numerics, start).name
 
     def so_far(end: State, tallies: Sequence[Tally]) -> tuple[State, Sample]:
-        """The sample in NumPy, as JAX would compile its part for each number of blocks."""
+        """The sample in NumPy: JAX would compile this again for each number of blocks."""
         measured = _with_length(replace(sample_of_blocks(flow, end, tallies), engine=engine))
         state, measured = jax.tree.map(lambda x: x[0] if single else x, (end, measured))
         return jax.tree.map(jnp.asarray, state), measured

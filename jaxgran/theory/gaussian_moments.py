@@ -87,7 +87,7 @@ def mixture_moments(
     ================  =======  ====================================================
     """
     alpha, nu, rate = as_floats(restitution, packing_fraction, shear_rate)
-    guess = jnp.log(garzo_dufty(alpha, nu).granular_temperature * jnp.sum(fractions * masses))
+    guess = jnp.log(garzo_dufty(alpha, nu).granular_temperature * masses)
     return steady_moments(alpha, rate, mixture_of(nu, diameters, masses, fractions), guess)
 
 
@@ -95,11 +95,11 @@ def steady_moments(
     alpha: Float[Array, ""],
     rate: Float[Array, ""],
     mixture: Mixture,
-    guess: Float[Array, ""],
+    guess: Float[Array, "*classes"],
     length: Float[Array, ""] | float = 1.0,
 ) -> SteadyShear:
-    """Solve the balance of the moments of a mixture, from a guess of the logarithm of its
-    temperature.
+    """Solve the balance of the moments of a mixture, from a guess of the logarithms of the
+    temperatures of its classes, or of one for all.
 
     Collisions lose 1/length of the energy that they lose in Enskog's theory.
     """
@@ -113,8 +113,8 @@ def steady_moments(
         source = enskog_collisions(tensors, alpha, unit_rate, mixture, length).source
         return (source[[0, 1, 0], [0, 1, 1]] - shear) / (xx + yy)[None, :]
 
-    guesses = jnp.stack([guess, guess, -0.3 * jnp.ones_like(guess)])
-    start = guesses[:, None] * jnp.ones_like(mixture.diameters)[None, :]
+    of_class = jnp.broadcast_to(guess, mixture.diameters.shape)
+    start = jnp.stack([of_class, of_class, jnp.full_like(of_class, -0.3)])
     solution = jax.lax.custom_root(imbalance, start, _newton, _dense_solve)
 
     tensors = _temperatures(solution)
