@@ -376,6 +376,13 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "a dictionary of numbers": lambda: make_map("observe", lambda seen: seen.state.side),
     "names that a map does not have, not 'seeds'": lambda: make_map("attributes", {"seeds": 7}),
     "attributes must be texts or numbers": lambda: make_map("attributes", {"label": None}),
+    "numbers of 64 bits, not True": lambda: make_map("attributes", {"final": True}),
+    "of 64 bits, not 1180591620717411303424": lambda: make_map("attributes", {"large": 2**70}),
+    "begin with a letter and have no slash, not 'a/b'": lambda: make_map("attributes", {"a/b": 1}),
+    "begin with a letter and have no slash, not '_Fi": lambda: make_map(
+        "attributes", {"_FillValue": 1.0}
+    ),
+    "a map does not have, not 'CLASS'": lambda: make_map("attributes", {"CLASS": "x"}),
     "output must be": lambda: make_map("output", "map.txt"),
     "resume": lambda: make_map("resume", True),
     # fields, figures, pages, files

@@ -194,3 +194,12 @@ def test_the_numbers_of_an_axis_are_the_decimals_that_they_stand_for(lists: Any)
     assert settings.timestep == (3e-4,)
     with refused("without repetition"):
         chosen(**{**GOOD, "restitution": [0.3, 0.1 + 0.2]})
+
+
+@pytest.mark.parametrize("kinds", [3, 4, 8])
+@pytest.mark.parametrize("error", [0.11, 0.09])
+def test_automatic_grains_are_as_many_of_each_diameter(kinds: int, error: float) -> None:
+    flow = {"restitution": (0.2,), "packing_fraction": (0.6,), "strain": None}
+    sizes = {"diameters": tuple(np.linspace(1, 1.4, kinds).tolist()), "grains": "auto"}
+    settings, _ = chosen(**flow, **sizes, seeds=2, timestep=1e-3, error=error)
+    assert settings.grains[0] % kinds == 0

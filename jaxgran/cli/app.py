@@ -14,6 +14,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 # Matrices here are small: threads of OpenBLAS, which NumPy loads, wait for each other longer than
 # they calculate.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ["MPLBACKEND"] = "agg"  # figures are files, and the backend of a user may be missing here
 
 import jaxgran
 from jaxgran.cli.explore import EXPLORE_EXAMPLES, explore_command

@@ -65,7 +65,8 @@ def cheapest(settings: MapSettings, error: float) -> Plan:
     """The numbers of grains (points,) that reach an error at the least cost; InputError where none
     reaches it.
     """
-    plans = plans_of_sizes(settings, error, _SIZES[_SIZES <= MAX_GRAINS])
+    sizes = _with_all(settings.diameters, _SIZES)
+    plans = plans_of_sizes(settings, error, sizes[sizes <= MAX_GRAINS])
     best = np.argmin(plans.seconds, axis=1)
     plan = Plan(*(x[np.arange(len(best)), best] for x in plans))
     if not np.isfinite(plan.seconds).all():
@@ -77,6 +78,12 @@ def cheapest(settings: MapSettings, error: float) -> Plan:
         )
         raise refused("error", error, reason)
     return plan
+
+
+def _with_all(diameters: Any, sizes: ArrayLike) -> np.ndarray:
+    """Numbers of grains, raised so that there are as many of each of the given diameters."""
+    kinds = len(diameters) if isinstance(diameters, tuple) and diameters else 1
+    return -(-np.asarray(sizes) // kinds) * kinds
 
 
 def plans_of_sizes(settings: MapSettings, error: float, sizes: np.ndarray) -> Plan:
@@ -221,6 +228,8 @@ def chosen_settings(parameters: Mapping[str, Any]) -> tuple[MapSettings, str]:
     if not automatic:
         return MapSettings(**plain), ""
     safe = {name: _SAFE[name] for name in automatic}
+    if "grains" in safe:
+        safe["grains"] = int(_with_all(plain.get("diameters"), safe["grains"]))
     checked = MapSettings(**{**plain, **safe, "strain": None})
     in_order = ("restitution", "packing_fraction", "grains_by_point")
     chosen = plain | {name: getattr(checked, name) for name in in_order}

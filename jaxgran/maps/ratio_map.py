@@ -4,6 +4,7 @@ dataset and a file.
 
 import math
 import os
+import re
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
@@ -47,6 +48,8 @@ _OF_RUN = (
     *("wall_time_seconds", "replica_steps_per_second"),
 )
 """Attributes of a map that are no parameters and not those of ``run_attributes``."""
+_OF_NETCDF = ("CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST")
+_NAME = re.compile(r"[^\W\d_]([^/\x00-\x1f]*[^/\x00-\x20])?")  # of an attribute in NetCDF
 _FEW_ON_AN_ACCELERATOR = 1000
 """Replicas below which an accelerator is hardly faster than two cores (``device_batch``)."""
 
@@ -267,18 +270,23 @@ def _require_own_observables(settings: MapSettings) -> None:
 
 
 def _require_own_attributes(run: RunOptions, settings: MapSettings) -> None:
-    """Raise an InputError if the user's attributes have a name of the map's; only the command may
-    be given.
+    """Raise an InputError if the user's attributes, but for the command, have a name of the map's
+    or cannot be held by NetCDF.
     """
-    names = set(run.attributes or {}) - {"command"}
-    if not names:
+    given = {name: x for name, x in (run.attributes or {}).items() if name != "command"}
+    if not given:
         return
-    for name in names & {*OPTIONS, *run_attributes(settings), *_OF_RUN}:
-        raise refused("attributes", name, "must have names that a map does not have")
-    for name in names:
-        value = (run.attributes or {})[name]
-        if not isinstance(value, str | int | float):
-            raise refused("attributes", value, "must be texts or numbers")
+    taken = {*OPTIONS, *run_attributes(settings), *_OF_RUN, *_OF_NETCDF}
+    for name, value in given.items():
+        if name in taken:
+            raise refused("attributes", name, "must have names that a map does not have")
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            reason = "must have names that begin with a letter and have no slash"
+            raise refused("attributes", name, reason)
+        whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
+        text = isinstance(value, str) and "\0" not in value
+        if not whole and not text and not isinstance(value, float):
+            raise refused("attributes", value, "must be texts or numbers of 64 bits")
 
 
 def _workers(run: RunOptions) -> int:

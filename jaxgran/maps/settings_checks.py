@@ -118,7 +118,8 @@ def _check_diameters(settings: MapSettings, flows: Sequence[ShearFlow]) -> None:
     sizes = dict.fromkeys(settings.grains_by_point or settings.grains)
     if any(size % len(settings.diameters) for size in sizes):
         words = ", ".join(map(str, sizes))
-        reason = f"must be a list whose length divides the number of grains, {words}"
+        reason = f"must be a list whose length divides the number of grains, {words}, or `grains` "
+        reason += f"a multiple of {len(settings.diameters)}"
         raise refused("diameters", list(settings.diameters), reason)
     densest = max(flows, key=lambda flow: float(flow.packing_fraction))
     for size in sizes:
