@@ -57,9 +57,8 @@ def run_map_command(
     output = given.setdefault(
         "output", Path("jaxgran_map.nc" if preset == "quick" else f"jaxgran_map_{preset}.nc")
     )
-    whole = "part" not in given
     overwrite, existed = given.get("overwrite", False), os.path.exists(output)
-    if whole and not overwrite:
+    if "part" not in given and not overwrite:
         require_new_figures(output, format)
     data, interrupted, written = run_map(given, quiet)
     whole, pictures = "part" not in data.attrs, []  # the rest of a part is in other files

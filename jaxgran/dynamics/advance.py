@@ -13,7 +13,7 @@ from jaxgran.dynamics.engine import Engine, Jax, Numba, Numerics, checked_numeri
 from jaxgran.dynamics.jax_engine import events_by_jax
 from jaxgran.dynamics.observer import Observe, uses_traced_values
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.checks import refused, require, require_function, require_hashable
+from jaxgran.model.checks import refused, require, require_static_function
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.flow import ShearFlow, flow_of_state
 from jaxgran.model.state import State, require_state
@@ -79,8 +79,7 @@ def advance(
       True
     """
     numerics = checked_numerics(solver, engine)
-    require_function("observe", observe)
-    require_hashable("observe", observe)
+    require_static_function("observe", observe)
     batch = checked_batch(require_advance, flow, state, steps)
 
     def of_replica(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:

@@ -166,7 +166,7 @@ def expected_correlation_strain(
         *(np.clip(getattr(flows, x), *table.range(x)) for x in ("restitution", "packing_fraction"))
     )
     logs = table.series(where)
-    theory = predicted(flows, settings.size_classes(np.size(flows.restitution)))
+    theory = predicted(flows, settings.discs)
     averages = {
         name: np.asarray(getattr(theory, name), float) * np.exp(logs[CORRECTED + name] - logs[name])
         for name in THEORY

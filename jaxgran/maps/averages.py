@@ -4,10 +4,8 @@ replicas of its row.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from operator import itemgetter
 from typing import Any
 
-import jax
 import numpy as np
 
 from jaxgran.maps.replica import Replica
@@ -70,11 +68,11 @@ def columns(
       replicas: those of each point.
       fewer_seeds: whether points may have fewer seeds than others, and are measured then.
     """
-    flows, classes = list(settings.flows.values()), settings.size_classes(len(settings.points))
-    rows = []
-    for k, (flow, measured) in enumerate(zip(flows, samples, strict=True)):
-        grains = None if classes is None else jax.tree.map(itemgetter(k), classes)
-        rows.append(_measured(flow, measured, grains) if measured else {})
+    discs = settings.discs
+    rows = [
+        _measured(flow, measured, discs) if measured else {}
+        for flow, measured in zip(settings.flows.values(), samples, strict=True)
+    ]
     known = _in_columns(rows)
     drifting = np.array([row.get("drifting", False) for row in rows])
     large = _large_system(settings, known)
@@ -166,7 +164,7 @@ def _predicted(settings: MapSettings) -> dict[str, np.ndarray]:
         flows.packing_fraction,
         flows.shear_rate,
         flows.polydispersity,
-        settings.size_classes(len(settings.points)),
+        settings.discs,
     )
     known = {name: getattr(theory, name) for name in PREDICTED}
     with np.errstate(invalid="ignore"):

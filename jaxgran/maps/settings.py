@@ -247,11 +247,14 @@ class MapSettings:
         discs = own_grains(np.resize(self.diameters, size))
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (replicas, size)), discs)
 
-    def size_classes(self, replicas: int) -> "Grains | None":
-        """Discs in the proportions of the given diameters, for kinetic theory; None where diameters
-        are uniform.
+    @property
+    def discs(self) -> "Grains | None":
+        """A disc of each of the given diameters, for kinetic theory; None where diameters are
+        uniform.
         """
-        return None if self.diameters is None else self.grains_of(len(self.diameters), replicas)
+        from jaxgran.model.grains import own_grains
+
+        return None if self.diameters is None else own_grains(np.asarray(self.diameters))
 
 
 def rounded(number: Any) -> Any:

@@ -23,8 +23,8 @@ from jaxgran.model.checks import (
     InputError,
     refused,
     require_flag,
-    require_hashable,
     require_number,
+    require_static_function,
     require_whole,
     short_repr,
     two_digits,
@@ -144,7 +144,7 @@ def _check_observe(observe: Any, flow: ShearFlow) -> None:
     if not callable(observe):
         reason = "must be a function that is passed to `ratio_map`, or None"
         raise refused("observe", observe, reason)
-    require_hashable("observe", observe)
+    require_static_function("observe", observe)
     shapes = observed_shapes(observe, flow)
     names = list(shapes) if isinstance(shapes, dict) else []
     if not names or not all(isinstance(x, jax.ShapeDtypeStruct) for x in shapes.values()):
@@ -240,8 +240,7 @@ def stack_of_any_size(flows: Iterable[ShearFlow]) -> ShearFlow:
 
 def temperature_of(settings: MapSettings, flows: ShearFlow) -> np.ndarray:
     """Expected granular temperature of each flow, in mσ²/t²."""
-    grains = settings.size_classes(np.size(flows.restitution))
-    theory = predicted(flows, grains).granular_temperature
+    theory = predicted(flows, settings.discs).granular_temperature
     return expected_temperature(theory, flows.packing_fraction, flows.shear_rate)
 
 

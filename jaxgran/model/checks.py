@@ -184,8 +184,9 @@ def require_function(name: str, value: Any) -> None:
         raise refused(name, value, "must be a function or None")
 
 
-def require_hashable(name: str, value: Any) -> None:
-    """Raise an InputError unless JAX can tell the program of a function from that of another."""
+def require_static_function(name: str, value: Any) -> None:
+    """Raise an InputError unless the value is None or a function that JAX can take as static."""
+    require_function(name, value)
     try:
         hash(value)
     except TypeError:

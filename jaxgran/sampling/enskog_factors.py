@@ -99,11 +99,12 @@ def measured_over_enskog(
     """
     if grains is None:
         _require_uniform(flow, seeds[0])
+    classes = None if grains is None else size_classes(grains)
     sums = jax.tree.map(
         lambda *x: np.stack([np.asarray(part) for part in x]), *(seed.tally for seed in seeds)
     )
     return standard_errors(
-        partial(_factors, flow, grains, np.asarray(seeds[0].area)), sums, *lengths(seeds)
+        partial(_factors, flow, classes, np.asarray(seeds[0].area)), sums, *lengths(seeds)
     )
 
 
@@ -121,7 +122,7 @@ def _require_uniform(flow: ShearFlow, sample: Sample) -> None:
 
 
 def _factors(
-    flow: ShearFlow, grains: Grains | None, area: np.ndarray, tally: Tally
+    flow: ShearFlow, classes: Any, area: np.ndarray, tally: Tally
 ) -> dict[str, np.ndarray]:
     """Factors, Enskog's rates and correlation lengths of tallies with one leading axis."""
     volume = area * tally.duration
@@ -134,7 +135,7 @@ def _factors(
     with np.errstate(divide="ignore", invalid="ignore"):
         temperatures = granular * np.eye(2), local * np.eye(2), local / granular * tensor
         (enskog, _), (isotropic, _), (chaotic, chaotic_speeds) = (
-            _enskog(flow, grains, tensor) for tensor in temperatures
+            _enskog(flow, classes, tensor) for tensor in temperatures
         )
         factors = {}
         for name, (weight, power) in RATES.items():
@@ -173,7 +174,7 @@ def _stresses(stress: Array | np.ndarray) -> dict[str, Any]:
 
 
 def _enskog(
-    flow: ShearFlow, grains: Grains | None, tensors: Array | np.ndarray
+    flow: ShearFlow, classes: Any, tensors: Array | np.ndarray
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Rates of ``collisional_transfer`` at tensors (rows, 2, 2), and its stresses times the speed
     of approach.
@@ -186,7 +187,6 @@ def _enskog(
     filled = tensors[np.arange(-(-count // _TOGETHER) * _TOGETHER) % count].reshape(
         -1, _TOGETHER, 2, 2
     )
-    classes = None if grains is None else size_classes(grains)
     parts = [_collisional_transfer(part, classes, *numbers) for part in filled]
     collisions = jax.tree.map(
         lambda *x: np.concatenate([np.asarray(part, np.float64) for part in x])[:count], *parts

@@ -27,13 +27,13 @@ def kinetic_theory(
 ) -> SteadyShear:
     """``gaussian_moments`` of many flows, (replicas,) each; not finite where α is 1.
 
-    Given grains (replicas, grains) are taken as a mixture of ``size_classes``.
+    Given grains, (grains,) or (replicas, grains), are taken as a mixture of ``size_classes``.
     """
     numbers = np.stack(
         np.broadcast_arrays(restitution, packing_fraction, shear_rate, polydispersity), axis=-1
     )
-    classes = () if grains is None else [x.astype(numbers.dtype) for x in size_classes(grains)]
-    count = len(numbers)
+    count, given = len(numbers), () if grains is None else size_classes(grains)
+    classes = [np.broadcast_to(x.astype(numbers.dtype), (count, _SIZE_CLASSES)) for x in given]
     places = np.arange(-(-count // _TOGETHER) * _TOGETHER).reshape(-1, _TOGETHER) % count
     parts = [_moments(numbers[some], *(x[some] for x in classes)) for some in places]
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)

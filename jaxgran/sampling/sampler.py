@@ -24,7 +24,7 @@ from jaxgran.model.checks import (
     is_traced,
     require,
     require_function,
-    require_hashable,
+    require_static_function,
     require_whole,
 )
 from jaxgran.model.flow import (
@@ -124,8 +124,7 @@ def sample(
     check = partial(_require_sheared_state, blocks)
     batch = checked_batch(check, flow, state, strain)
     numerics = checked_numerics(solver, engine)
-    require_function("observe", observe)
-    require_hashable("observe", observe)
+    require_static_function("observe", observe)
     require_function("callback", callback)
     if callback is None:
         if batch is None:
