@@ -12,7 +12,7 @@ from llvmlite import binding as llvm
 
 from jaxgran.dynamics.numba_engine import layout
 from jaxgran.dynamics.numba_engine.team import linking
-from jaxgran.dynamics.numba_engine.team.lanes import BARRIER
+from jaxgran.dynamics.numba_engine.team.lanes import BARRIER, EXCHANGE, VOTE
 from jaxgran.dynamics.numba_engine.team.memory import words_needed
 
 _WORDS = 5 + linking.BUFFERS + 1
@@ -21,12 +21,35 @@ _ENTRY = f"""
 declare i32 @pthread_barrier_wait(ptr)
 declare i32 @KERNEL(ptr, ptr, {", ".join(["i64"] * _WORDS)})
 @barrier = global [64 x i8] zeroinitializer, align 16
+@words = global [32 x i64] zeroinitializer, align 16
+@votes = global i64 0
 define ptr @team_barrier() {{
   ret ptr @barrier
 }}
 define void @{BARRIER}() alwaysinline {{
   WAIT
   ret void
+}}
+define i64 @{EXCHANGE}(i64 %lane, i64 %word, i64 %wanted) alwaysinline {{
+  %own = getelementptr i64, ptr @words, i64 %lane
+  %place = getelementptr i64, ptr @words, i64 %wanted
+  store volatile i64 %word, ptr %own
+  WAIT
+  %other = load volatile i64, ptr %place
+  WAIT
+  ret i64 %other
+}}
+define i64 @{VOTE}(i64 %lane, i64 %agrees) alwaysinline {{
+  %yes = icmp ne i64 %agrees, 0
+  %one = zext i1 %yes to i64
+  %bit = shl i64 %one, %lane
+  %others = xor i64 %bit, -1
+  %a = atomicrmw or ptr @votes, i64 %bit seq_cst
+  WAIT
+  %result = load atomic i64, ptr @votes seq_cst, align 8
+  WAIT
+  %b = atomicrmw and ptr @votes, i64 %others seq_cst
+  ret i64 %result
 }}
 define void @{layout.KERNEL}({_NAMES}) {{
   %result = alloca i64

@@ -3,13 +3,14 @@ other: ``NUMBA_DISABLE_JIT=1 python team_races.py STATE.npz LANES [WITHOUT]``, w
 of a function.
 
 Between two barriers an element that one lane writes may not be touched by another one, unless all
-write the same. All lanes must come to the same barrier by the same calls. Prints the number of
-barriers, and what is wrong.
+write the same; what lanes exchange without memory is no barrier. All lanes must come to the same
+barrier or exchange by the same calls. Prints the number of barriers, and what is wrong.
 """
 
 import sys
 import threading
 from collections import defaultdict
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -71,12 +72,24 @@ class Row:
         writes[self.watched.name, *self.place, field][lane_here.number] = value
 
 
+def replace(**others: Any) -> None:
+    """Replace what is compiled for a device, and numbers."""
+    for module in (lanes, loop, contacts):
+        for name, other in others.items():
+            setattr(module, name, other)
+
+
+def compare_sites() -> None:
+    """Called by one lane, while all are at a barrier or an exchange."""
+    if len(set(sites.values())) > 1:
+        wrong.add(f"lanes wait at different places: {set(sites.values())}")
+
+
 def compare() -> None:
     """Called by one lane, while all are at a barrier."""
     global barriers
     barriers += 1
-    if len(set(sites.values())) > 1:
-        wrong.add(f"lanes wait at different barriers: {set(sites.values())}")
+    compare_sites()
     for element, by_lane in writes.items():
         differ = len({repr(x) for x in by_lane.values()}) > 1
         if differ or reads.get(element, set()) - set(by_lane):
@@ -87,17 +100,18 @@ def compare() -> None:
 
 
 def fill_the_room() -> None:
-    """More indices are wanted than there is room for; no lane may write beyond it."""
-    for module in (lanes, contacts):
-        module.sync = lambda: None
-    alone = lanes.Team(0, 1, np.zeros(1, np.int64), np.zeros(1))
+    """More contacts are wanted than there is room for; no lane may write beyond it."""
+    replace(sync=lambda: None, ballot=lambda team, agrees: np.uint64(agrees))
     written = np.zeros(3, np.int64)
+    pairs = SimpleNamespace(calendar=np.array([[0] * 5, [0] * 5, [9] * 5]))
+    network = SimpleNamespace(near_pair=written)
+    alone = lanes.Team(np.uint64(0), np.uint64(1))
     try:
-        found = contacts.indices_of(alone, np.ones(5), 1, 5, written, 1)
+        found = loop._contacts_of_step(alone, 1, 5, pairs, network)
     except IndexError as problem:
         wrong.add(f"beyond the room: {problem}")
     else:
-        if found != 5 or written.tolist() != [0, 0, 1]:
+        if found != 5 or written.tolist() != [0, 1, 2]:
             wrong.add(f"{found} indices are found and {written} written")
 
 
@@ -105,24 +119,42 @@ def main(file: str, count_of_lanes: int, without: str = "") -> None:
     fill_the_room()
     given = np.load(file)
     meeting = threading.Barrier(count_of_lanes, action=compare)
+    exchange = threading.Barrier(count_of_lanes, action=compare_sites)
+    words: list[Any] = [None] * count_of_lanes
 
-    def sync() -> None:
-        frame, calls = sys._getframe(1), []
-        if frame.f_code.co_name == without:
-            return
-        while frame is not None and frame.f_code.co_name != "advance_team":
+    def note_site() -> bool:
+        """Note the calls of this lane; returns whether they are to be left out."""
+        frame: Any = sys._getframe(2)
+        left_out, calls = frame.f_code.co_name == without, []
+        while frame.f_code.co_name != "run":
             calls.append(frame.f_lineno)
             frame = frame.f_back
-        sites[lane_here.number] = (*calls, frame.f_lineno)
-        meeting.wait(60)
+        sites[lane_here.number] = tuple(calls)
+        return left_out
+
+    def sync() -> None:
+        if not note_site():
+            meeting.wait(60)
+
+    def words_of_all(word: Any) -> list[Any]:
+        note_site()
+        words[lane_here.number] = word
+        exchange.wait(60)
+        given = list(words)
+        exchange.wait(60)
+        return given
+
+    def of_lane(team, number, lane):
+        return words_of_all(number)[int(lane)]
+
+    def ballot(team, agrees) -> np.uint64:
+        return np.uint64(sum(bool(x) << n for n, x in enumerate(words_of_all(agrees))))
 
     def add_terms(sums, first, terms) -> None:
         for n, term in enumerate(terms):
             sums[first + n] += term
 
-    for module in (lanes, loop, contacts):
-        module.sync = sync
-    contacts._add_terms = add_terms
+    replace(sync=sync, of_lane=of_lane, ballot=ballot, _add_terms=add_terms)
     count = len(given["radii"])
     slots, most = 16 * count, 3 * count
 
@@ -140,7 +172,10 @@ def main(file: str, count_of_lanes: int, without: str = "") -> None:
             watched("images", (2, slots), f8),
             watched("calendar", (3, slots), i4),
             watched("listed", slots, u4),
-            watched("of_grain", 2 * slots, u4),
+            watched("found", 2 * slots, u4),
+            watched("starts", max(9, 2 * count) + 1, u4),
+            watched("cells", count, u4),
+            watched("sorted", count, u4),
         ),
         Network(
             watched("near_pair", most, u4),
@@ -166,14 +201,13 @@ def main(file: str, count_of_lanes: int, without: str = "") -> None:
     inputs = layout.Inputs(*given["inputs"])
     new = [watched("new positions", (count, 2), f8), watched("new velocities", (count, 2), f8)]
     results = watched("results", (steps.size, layout.RESULTS), f8)
-    whole, real = watched("whole", count_of_lanes, np.int64), watched("real", count_of_lanes, f8)
 
     def run(number: int) -> None:
         lane_here.number = number
         arrays = (given[x] for x in ("positions", "velocities", "radii", "masses"))
         try:
             loop.advance_team(
-                lanes.Team(number, count_of_lanes, whole, real),
+                lanes.Team(np.uint64(number), np.uint64(count_of_lanes)),
                 *arrays,
                 inputs,
                 steps,
@@ -185,6 +219,7 @@ def main(file: str, count_of_lanes: int, without: str = "") -> None:
         except BaseException as problem:
             wrong.add(f"lane {number}: {problem!r}")
             meeting.abort()
+            exchange.abort()
             raise
 
     threads = [threading.Thread(target=run, args=(n,)) for n in range(count_of_lanes)]
@@ -198,4 +233,6 @@ def main(file: str, count_of_lanes: int, without: str = "") -> None:
 
 if __name__ == "__main__":
     np.seterr(all="ignore")
+    # few sweeps, so that the method that follows them is needed
+    replace(bits_of=lambda word: int(word).bit_count(), SWEEPS=3)
     main(sys.argv[1], int(sys.argv[2]), *sys.argv[3:])

@@ -47,13 +47,58 @@ def find_near_pairs(grains, pairs, side, tilt, reach, skin, capacity):
     """Write the pairs with a gap within the skin, and their images; pairs beyond the capacity
     are counted, not written.
     """
-    most = math.sqrt(pairs.starts.size - 1)
-    rows = whole_part(side / reach, most)
-    columns = whole_part(side / (reach * math.sqrt(1.0 + tilt * tilt)), most)
-    if rows >= 3 and columns >= 3:
+    rows, columns = grid_of(reach, side, tilt, pairs.starts.size - 1)
+    if rows > 0:
         _sort_into_cells(grains, pairs, side, tilt, rows, columns)
         return _pairs_of_cells(pairs, side, tilt, rows, columns, skin, capacity)
     return _pairs_of_all(grains, pairs, side, tilt, skin, capacity)
+
+
+@njit
+def grid_of(reach, side, tilt, most_cells):
+    """Rows and columns of a grid whose cells are as wide as the reach; none where it would be
+    smaller than 3×3.
+    """
+    most = math.sqrt(most_cells)
+    rows = whole_part(side / reach, most)
+    columns = whole_part(side / (reach * math.sqrt(1.0 + tilt * tilt)), most)
+    return (rows, columns) if rows >= 3 and columns >= 3 else (0, 0)
+
+
+@njit
+def cell_of(x, y, side, tilt, rows, columns):
+    """The number of the cell of a place, row by row."""
+    row = whole_part(y / side * rows, rows - 1)
+    return row * columns + whole_part((x - tilt * y) / side * columns, columns - 1)
+
+
+@njit
+def stretch_of(part, cell, rows, columns, starts):
+    """Half of the cells around a cell in four stretches of sorted grains: itself and its right
+    neighbour, the three above it, and those of either across the boundary; returns the first grain,
+    the end, and the column and the row of the image.
+    """
+    row, column = cell // columns, cell % columns
+    above, image_above = (row + 1) * columns, 0  # first cell of the next row, and its image
+    if row + 1 == rows:
+        above, image_above = 0, 1
+    begin = end = image_column = image_row = 0
+    if part == 0:
+        begin, end = starts[cell], starts[cell + 1 if column + 1 == columns else cell + 2]
+    elif part == 1 and column + 1 == columns:
+        begin, end = starts[row * columns], starts[row * columns + 1]
+        image_column = 1
+    elif part == 2:
+        begin = starts[above + max(column - 1, 0)]
+        end = starts[above + min(column + 2, columns)]
+        image_row = image_above
+    elif part == 3 and column == 0:
+        begin, end = starts[above + columns - 1], starts[above + columns]
+        image_column, image_row = -1, image_above
+    elif part == 3 and column + 1 == columns:
+        begin, end = starts[above], starts[above + 1]
+        image_column, image_row = 1, image_above
+    return begin, end, image_column, image_row
 
 
 @njit
@@ -61,9 +106,7 @@ def _sort_into_cells(grains, pairs, side, tilt, rows, columns):
     """Sort the grains into cells row by row, and write their positions and radii in this order."""
     motion, constants, cells, places = grains.motion, grains.constants, pairs.cells, pairs.places
     for g in range(motion.size):
-        row = whole_part(motion[g].y / side * rows, rows - 1)
-        fraction = (motion[g].x - tilt * motion[g].y) / side
-        cells[g] = row * columns + whole_part(fraction * columns, columns - 1)
+        cells[g] = cell_of(motion[g].x, motion[g].y, side, tilt, rows, columns)
     sort_by_cell(cells, rows * columns, pairs.starts, pairs.sorted)
     for n in range(motion.size):
         g = pairs.sorted[n]
@@ -77,27 +120,8 @@ def _pairs_of_cells(pairs, side, tilt, rows, columns, skin, capacity):
     ends, images = pairs.ends, pairs.images
     count = 0
     for cell in range(rows * columns):
-        row, column = cell // columns, cell % columns
-        above, image_above = (row + 1) * columns, 0  # first cell of the next row, and its image
-        if row + 1 == rows:
-            above, image_above = 0, 1
-        for part in range(4):  # stretches of cells in a row, those across the boundary apart
-            begin = end = image_column = image_row = 0
-            if part == 0:
-                end = starts[cell + 1 if column + 1 == columns else cell + 2]
-            elif part == 1 and column + 1 == columns:
-                begin, end = starts[row * columns], starts[row * columns + 1]
-                image_column = 1
-            elif part == 2:
-                begin = starts[above + max(column - 1, 0)]
-                end = starts[above + min(column + 2, columns)]
-                image_row = image_above
-            elif part == 3 and column == 0:
-                begin, end = starts[above + columns - 1], starts[above + columns]
-                image_column, image_row = -1, image_above
-            elif part == 3 and column + 1 == columns:
-                begin, end = starts[above], starts[above + 1]
-                image_column, image_row = 1, image_above
+        for part in range(4):
+            begin, end, image_column, image_row = stretch_of(part, cell, rows, columns, starts)
             image_x, image_y = (image_column + image_row * tilt) * side, image_row * side
             for m in range(starts[cell], starts[cell + 1]):
                 i, x, y = sorted_grains[m], places[0, m] - image_x, places[1, m] - image_y

@@ -41,8 +41,15 @@ from jaxgran.dynamics.numba_engine.layout import (
 from jaxgran.dynamics.numba_engine.network import write_contact
 from jaxgran.dynamics.numba_engine.sums import FIRST_TERM, LARGEST_OVERLAP, add_solve, terms_of
 from jaxgran.dynamics.numba_engine.team.lanes import (
+    ballot,
     before_and_total,
+    in_turns,
+    lanes_in_turn,
     largest,
+    lower_lanes,
+    of_lane,
+    own_index,
+    place_in_list,
     shared_out,
     sum_of,
     sync,
@@ -76,25 +83,6 @@ def _add_terms(context, sums, first, terms):
 
 
 @njit
-def indices_of(team, keys, wanted, count, out, begin):
-    """Write the indices of the keys that are wanted from ``out[begin]`` on, as far as there is room
-    for them; returns how many there are. A lane reads the keys that it has written.
-    """
-    found = 0
-    for n in shared_out(team, count):
-        found += keys[n] == wanted
-    before, total = before_and_total(team, found)
-    place = begin + before
-    for n in shared_out(team, count if found > 0 else 0):
-        if keys[n] == wanted:
-            if place < out.size:
-                out[place] = n
-            place += 1
-    sync()
-    return total
-
-
-@njit
 def collide(team, contacts, t, flow, grains, pairs, network, clusters, sums):
     """Solve the contacts of a step and add them to the sums; returns how many approach, and the
     status. The impulses on the grains are in ``network.impulses``.
@@ -109,6 +97,7 @@ def collide(team, contacts, t, flow, grains, pairs, network, clusters, sums):
             g = network.ends[end, c]
             impulses[g, 0] = impulses[g, 1] = 0.0
     _, approaching = before_and_total(team, own_approaching)
+    sync()
     most, all_coloured = _colour(team, contacts, network)
     coupled = _isolate_and_sort(team, contacts, most, grains, network, clusters)
     iterations, residual, status = 1, 0.0, OK
@@ -134,28 +123,41 @@ def collide(team, contacts, t, flow, grains, pairs, network, clusters, sums):
 
 @njit
 def _colour(team, contacts, network):
-    """Give every contact the lowest colour that neither of its grains has; returns the number of
-    colours, and whether they were enough.
+    """Give every contact the lowest colour that neither of its grains has, in the order of the
+    contacts; returns the number of colours, and whether they were enough.
+
+    Of the contacts that the lanes have at once, one waits for those of lower lanes that share a
+    grain with it.
     """
     colours, colour, ends = network.colours, network.colour, network.ends
-    if team.lane == 0:
-        every, enough = np.uint32(0), 1
-        for c in range(contacts):
-            i, j = ends[FIRST, c], ends[SECOND, c]
-            taken = colours[i] | colours[j]
-            bit = np.uint32(~taken & (taken + np.uint32(1)))
-            if bit == 0 or bit == _LAST_COLOUR:
-                bit, enough = _LAST_COLOUR, 0
-            colours[i], colours[j], colour[c] = colours[i] | bit, colours[j] | bit, bit
-            every |= bit
-        team.whole[0], team.real[0] = enough, every
-    sync()
-    enough, every = team.whole[0], np.uint32(team.real[0])
-    sync()
+    own_colours, enough = np.uint32(0), True
+    for first in in_turns(team, contacts):
+        c, here = own_index(team, first, contacts)
+        i, j = (ends[FIRST, c], ends[SECOND, c]) if here else (np.uint32(0), np.uint32(0))
+        both, before = np.uint64(i) << np.uint64(32) | np.uint64(j), np.uint64(0)
+        for n in range(lanes_in_turn(team, first, contacts)):
+            other = of_lane(team, both, n)
+            other_i, other_j = np.uint32(other >> np.uint64(32)), np.uint32(other)
+            shares = (i == other_i) | (i == other_j) | (j == other_i) | (j == other_j)
+            before |= np.uint64(shares) << n
+        before &= lower_lanes(team)
+        waiting = ballot(team, here)
+        while waiting != 0:
+            ready = here and before & waiting == 0
+            if ready:
+                taken = colours[i] | colours[j]
+                bit = np.uint32(~taken & (taken + np.uint32(1)))
+                if bit == 0 or bit == _LAST_COLOUR:
+                    bit, enough = _LAST_COLOUR, False
+                colours[i], colours[j], colour[c] = colours[i] | bit, colours[j] | bit, bit
+                own_colours |= bit
+                here = False
+            waiting &= ~ballot(team, ready)
+            sync()
     most = 0
-    while most < MOST_COLOURS and every >> np.uint32(most) > 0:
+    while most < MOST_COLOURS and ballot(team, own_colours >> np.uint32(most) > 0) > 0:
         most += 1
-    return most, enough == 1
+    return most, ballot(team, not enough) == 0
 
 
 @njit
@@ -177,7 +179,12 @@ def _isolate_and_sort(team, contacts, most, grains, network, clusters):
         if team.lane == 0:
             clusters.starts[n] = coupled
         bit = np.uint32(1) << np.uint32(n)
-        coupled += indices_of(team, network.colour, bit, contacts, clusters.source, coupled)
+        for first in in_turns(team, contacts):
+            c, here = own_index(team, first, contacts)
+            wanted = here and network.colour[c] == bit
+            place, coupled = place_in_list(team, wanted, coupled)
+            if wanted:
+                clusters.source[place] = c
     if team.lane == 0:
         clusters.starts[most] = coupled
     sync()
@@ -185,10 +192,14 @@ def _isolate_and_sort(team, contacts, most, grains, network, clusters):
 
 
 @njit
-def _of_colour(team, count, all_coloured):
-    """This lane's contacts of a colour; all are the first lane's where colours did not suffice."""
-    own = team.lane if all_coloured else np.uint64(0 if team.lane == 0 else count)
-    return range(own, np.uint64(count), team.lanes if all_coloured else np.uint64(1))
+def _share_of(team, begin, end, all_coloured):
+    """This lane's first contact of a colour, the end, and the stride; all contacts are the first
+    lane's where colours did not suffice.
+    """
+    begin, end = np.uint64(begin), np.uint64(end)
+    if all_coloured:
+        return begin + team.lane, end, team.lanes
+    return begin if team.lane == 0 else end, end, np.uint64(1)
 
 
 @njit
@@ -206,10 +217,11 @@ def _solve(team, size, most, all_coloured, target, flow, grains, network, cluste
     while keep_going:
         own_estimate = 0.0
         for colour in range(most):
-            first, end = starts[colour], starts[colour + 1]
-            for n in _of_colour(team, end - first, all_coloured):
-                change = relax(first + n, relaxation, rows, ends, dv)
+            n, end, stride = _share_of(team, starts[colour], starts[colour + 1], all_coloured)
+            while n < end:
+                change = relax(n, relaxation, rows, ends, dv)
                 own_estimate += change * change
+                n += stride
             sync()
         sweeps += 1
         estimate = sum_of(team, own_estimate)
@@ -219,6 +231,7 @@ def _solve(team, size, most, all_coloured, target, flow, grains, network, cluste
             for n in shared_out(team, size):
                 error = error_of(n, rows, ends, dv)
                 own_error += error * error
+            sync()
             squared_residual = sum_of(team, own_error)
             keep_going = keep_going and not squared_residual <= target
     status = OK
@@ -227,11 +240,12 @@ def _solve(team, size, most, all_coloured, target, flow, grains, network, cluste
             team, size, target, sweeps, squared_residual, flow.max_steps, clusters
         )
     for colour in range(most):
-        first, end = starts[colour], starts[colour + 1]
-        for n in _of_colour(team, end - first, all_coloured):
-            if rows[first + n].impulse > 0.0:
-                network.loaded[ends[first + n, FIRST]] += 1
-                network.loaded[ends[first + n, SECOND]] += 1
+        n, end, stride = _share_of(team, starts[colour], starts[colour + 1], all_coloured)
+        while n < end:
+            if rows[n].impulse > 0.0:
+                network.loaded[ends[n, FIRST]] += 1
+                network.loaded[ends[n, SECOND]] += 1
+            n += stride
         sync()
     for n in shared_out(team, size):
         network.rows[IMPULSE, clusters.source[n]] = rows[n].impulse
@@ -244,6 +258,7 @@ def _go_on(team, size, target, sweeps, squared_residual, max_steps, clusters):
     iterations, squared residual and status.
     """
     rows, ends, dv = clusters.rows, clusters.ends, clusters.dv
+    jammed = False
     if team.lane == 0:
         jammed = is_jammed(size, clusters)
         if squared_residual < math.inf and sweeps < max_steps:
@@ -256,12 +271,10 @@ def _go_on(team, size, target, sweeps, squared_residual, max_steps, clusters):
                     dv[ends[n, end], 0] = dv[ends[n, end], 1] = 0.0
             for n in range(size):
                 add_impulse(n, rows, ends, dv)
-        team.real[0] = squared_residual
-        team.whole[0] = 2 * sweeps + (1 if jammed else 0)
     sync()
-    squared_residual, both = team.real[0], team.whole[0]
-    sync()
-    return both // 2, squared_residual, status_of(squared_residual, target, both % 2 == 1)
+    squared_residual = of_lane(team, squared_residual, 0)
+    jammed = ballot(team, jammed) > 0
+    return of_lane(team, sweeps, 0), squared_residual, status_of(squared_residual, target, jammed)
 
 
 @njit

@@ -116,15 +116,15 @@ def kept_ptx() -> str:
     """
     from jaxgran.dynamics.numba_engine.team.linking import ptx
 
-    file = Path(f"{ffi.engine_folder()}-{layout.WARP}.ptx")
+    file = Path(f"{ffi.engine_folder()}.ptx")
     try:
         with file_lock(file):
             if not file.exists():
                 with atomic_write(file) as temporary:
-                    temporary.write_text(ptx(layout.WARP))
+                    temporary.write_text(ptx())
             return file.read_text()
     except OSError:
-        return ptx(layout.WARP)
+        return ptx()
 
 
 def words_of_memory(grains: int) -> int:

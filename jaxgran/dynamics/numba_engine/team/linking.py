@@ -19,7 +19,7 @@ from llvmlite import binding as llvm
 
 from jaxgran.dynamics.numba_engine import layout
 from jaxgran.dynamics.numba_engine.compilation import njit
-from jaxgran.dynamics.numba_engine.team.lanes import BARRIER, Team
+from jaxgran.dynamics.numba_engine.team.lanes import BARRIER, EXCHANGE, VOTE, Team
 from jaxgran.dynamics.numba_engine.team.loop import advance_team
 from jaxgran.dynamics.numba_engine.team.memory import array_at, memory_at
 
@@ -36,11 +36,9 @@ def _kernel(
     """Advance a replica by one lane, with all arguments in words: numbers, and addresses of the
     buffers of all replicas and of the memory of this one.
     """
-    whole, at = array_at(at, np.int64(lanes), np.int64)
-    real, at = array_at(at, np.int64(lanes), np.float64)
     memory, _ = memory_at(at, grains, lanes)
     of_grains, row = 8 * replica * grains, 8 * replica * layout.RESULTS
-    team = Team(np.uint64(lane), np.uint64(lanes), whole, real)
+    team = Team(np.uint64(lane), np.uint64(lanes))
     advance_team(
         team,
         array_at(x + 2 * of_grains, (grains, 2), np.float64)[0],
@@ -84,8 +82,9 @@ def linked(machine: llvm.TargetMachine, entry: str, *kept: str) -> llvm.ModuleRe
     """The loop with an entry, optimised for a machine.
 
     Args:
-      entry: a module in LLVM's language that defines ``BARRIER`` and calls ``@KERNEL``, whose
-        arguments are the addresses of a result and an exception, and then the words of ``_kernel``.
+      entry: a module in LLVM's language that defines the functions of ``lanes``, and calls
+        ``@KERNEL``, whose arguments are the addresses of a result and an exception, and then the
+        words of ``_kernel``.
       kept: names of its functions that are called from outside, beside ``layout.KERNEL``.
     """
     kernel, code = numba_code()
@@ -119,13 +118,33 @@ define double @FUNCTION(double %x) alwaysinline {
 _PARAMETERS = ", ".join(f"i64 %p{n}" for n in range(_WORDS - 3))
 _MEMORY = f"%p{_WORDS - 4}"
 _ON_DEVICE = f"""
-declare void @llvm.nvvm.barrier0() convergent
+declare void @llvm.nvvm.bar.warp.sync(i32) convergent
+declare i32 @llvm.nvvm.shfl.sync.idx.i32(i32, i32, i32, i32) convergent
+declare i32 @llvm.nvvm.vote.ballot.sync(i32, i1) convergent
 declare i32 @llvm.nvvm.read.ptx.sreg.tid.x()
 declare i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()
 declare i32 @KERNEL(ptr, ptr, {", ".join(["i64"] * _WORDS)}) convergent
 define void @{BARRIER}() convergent alwaysinline {{
-  call void @llvm.nvvm.barrier0()
+  call void @llvm.nvvm.bar.warp.sync(i32 -1)
   ret void
+}}
+define i64 @{EXCHANGE}(i64 %lane, i64 %word, i64 %wanted) convergent alwaysinline {{
+  %from = trunc i64 %wanted to i32
+  %halves = bitcast i64 %word to <2 x i32>
+  %low = extractelement <2 x i32> %halves, i32 0
+  %high = extractelement <2 x i32> %halves, i32 1
+  %a = call i32 @llvm.nvvm.shfl.sync.idx.i32(i32 -1, i32 %low, i32 %from, i32 31)
+  %b = call i32 @llvm.nvvm.shfl.sync.idx.i32(i32 -1, i32 %high, i32 %from, i32 31)
+  %c = insertelement <2 x i32> %halves, i32 %a, i32 0
+  %d = insertelement <2 x i32> %c, i32 %b, i32 1
+  %other = bitcast <2 x i32> %d to i64
+  ret i64 %other
+}}
+define i64 @{VOTE}(i64 %lane, i64 %agrees) convergent alwaysinline {{
+  %yes = icmp ne i64 %agrees, 0
+  %votes = call i32 @llvm.nvvm.vote.ballot.sync(i32 -1, i1 %yes)
+  %word = zext i32 %votes to i64
+  ret i64 %word
 }}
 define ptx_kernel void @{layout.KERNEL}({_PARAMETERS}, i64 %size) convergent {{
   %result = alloca i64
@@ -136,7 +155,7 @@ define ptx_kernel void @{layout.KERNEL}({_PARAMETERS}, i64 %size) convergent {{
   %replica = zext i32 %block to i64
   %offset = mul i64 %replica, %size
   %memory = add i64 {_MEMORY}, %offset
-  call i32 @KERNEL(ptr %result, ptr %exception, i64 %lane, i64 LANES, i64 %replica,
+  call i32 @KERNEL(ptr %result, ptr %exception, i64 %lane, i64 {layout.WARP}, i64 %replica,
     {_PARAMETERS.replace(_MEMORY, "%memory")})
   ret void
 }}
@@ -144,7 +163,7 @@ define ptx_kernel void @{layout.KERNEL}({_PARAMETERS}, i64 %size) convergent {{
 
 
 @cache
-def ptx(lanes: int = layout.WARP) -> str:
+def ptx() -> str:
     """The kernel in PTX, for all NVIDIA devices from ``PROCESSOR`` on: grains, blocks, addresses,
     and the memory of all replicas and of one of them.
     """
@@ -152,4 +171,4 @@ def ptx(lanes: int = layout.WARP) -> str:
     llvm.initialize_all_asmprinters()
     target = llvm.Target.from_triple("nvptx64-nvidia-cuda")
     machine = target.create_target_machine(cpu=PROCESSOR, features=_FEATURES, opt=3)
-    return machine.emit_assembly(linked(machine, _ON_DEVICE.replace("LANES", str(lanes))))
+    return machine.emit_assembly(linked(machine, _ON_DEVICE))

@@ -43,13 +43,27 @@ from jaxgran.dynamics.numba_engine.motion import (
     with_grain,
     write_grain,
 )
-from jaxgran.dynamics.numba_engine.near_pairs import ATTEMPTS, LIFE, closing_speed_bound
+from jaxgran.dynamics.numba_engine.near_pairs import (
+    ATTEMPTS,
+    LIFE,
+    cell_of,
+    closing_speed_bound,
+    grid_of,
+    stretch_of,
+)
 from jaxgran.dynamics.numba_engine.sums import add_flight
-from jaxgran.dynamics.numba_engine.team.contacts import collide, indices_of, strike
+from jaxgran.dynamics.numba_engine.team.contacts import collide, strike
 from jaxgran.dynamics.numba_engine.team.lanes import (
     before_and_total,
+    bits_of,
+    in_turns,
+    lanes_in_turn,
     largest,
     least,
+    lower_lanes,
+    of_lane,
+    own_index,
+    place_in_list,
     shared_out,
     sum_of,
     sync,
@@ -131,7 +145,7 @@ def advance_team(
         speed = closing_speed_bound(max_speed, shear_rate, 2 * largest_diameter, look_ahead)
         least_skin = 1.2 * look_ahead * speed
         skin = min(max(least_skin, usual_skin), widest_skin)
-        pair_count, skin, fits = _search(team, grains, pairs, side, tilt, skin)
+        pair_count, skin, fits = _search(team, grains, pairs, side, tilt, largest_diameter, skin)
         closing_speed = closing_speed_bound(
             max_speed, shear_rate, largest_diameter + skin, look_ahead
         )
@@ -233,31 +247,24 @@ def _bring_into_cell(team, grains, side, tilt, shear_rate):
         own = bring_grain_into_cell(g, grains, side, tilt, shear_rate)
         squared_speed = max(squared_speed, own) if own < math.inf else math.inf
         kinetic = with_grain(g, grains, shear_rate, kinetic)
+    sync()
     return math.sqrt(largest(team, squared_speed)), kinetic
 
 
 @njit
-def _search(team, grains, pairs, side, tilt, skin):
-    """List the near pairs by comparing all, with ever narrower skins while there is no room for
-    them; returns their number, the skin, and whether there was room.
+def _search(team, grains, pairs, side, tilt, largest_diameter, skin):
+    """List the near pairs, with ever narrower skins while there is no room for them; returns their
+    number, the skin, and whether there was room.
     """
-    motion, constants, found = grains.motion, grains.constants, pairs.of_grain
+    motion, found = grains.motion, pairs.found
     capacity, room = pairs.listed.size, found.size // np.int64(team.lanes)
     first = np.int64(team.lane) * room
     kept = before = total = 0
     fits = False
     for _ in range(ATTEMPTS):
-        kept = 0
-        for i in range(motion.size):
-            for j in shared_out(team, i):
-                dx, dy = motion[i].x - motion[j].x, motion[i].y - motion[j].y
-                column, row = nearest_image(dx, dy, side, tilt)
-                dx, dy = dx - (column * side + row * tilt * side), dy - row * side
-                reach = constants[i].radius + constants[j].radius + skin
-                if dx * dx + dy * dy <= reach * reach:
-                    if kept < room:
-                        found[first + kept] = np.uint32(i) << np.uint32(16) | np.uint32(j)
-                    kept += 1
+        kept = _find_near_pairs(
+            team, grains, pairs, side, tilt, largest_diameter + skin, skin, first, room
+        )
         spare = least(team, room - kept)
         before, total = before_and_total(team, kept)
         fits = spare >= 0 and total <= capacity
@@ -274,6 +281,74 @@ def _search(team, grains, pairs, side, tilt, skin):
         pairs.images[IMAGE_X, p] = column * side + row * tilt * side
         pairs.images[IMAGE_ROW, p] = row
     return total if fits else 0, skin, fits
+
+
+@njit
+def _find_near_pairs(team, grains, pairs, side, tilt, reach, skin, first, room):
+    """Write this lane's pairs with a gap within the skin from ``found[first]`` on, as far as there
+    is room; returns how many there are. Without a grid all pairs are compared.
+    """
+    motion, constants, order = grains.motion, grains.constants, pairs.sorted
+    rows, columns = grid_of(reach, side, tilt, pairs.starts.size - 1)
+    if rows > 0:
+        _sort_into_cells(team, motion, pairs, side, tilt, rows, columns)
+    kept = 0
+    for m in shared_out(team, motion.size):
+        i = order[m] if rows > 0 else np.uint32(m)
+        cell = np.int64(pairs.cells[i]) if rows > 0 else 0
+        for part in range(4 if rows > 0 else 1):
+            begin, end, column, row = 0, motion.size, 0, 0
+            if rows > 0:
+                begin, end, column, row = stretch_of(part, cell, rows, columns, pairs.starts)
+            for n in range(m + 1 if part == 0 else np.uint64(begin), np.uint64(end)):
+                j = order[n] if rows > 0 else np.uint32(n)
+                dx, dy = motion[i].x - motion[j].x, motion[i].y - motion[j].y
+                if rows == 0:
+                    column, row = nearest_image(dx, dy, side, tilt)
+                dx, dy = dx - (column * side + row * tilt * side), dy - row * side
+                distance = constants[i].radius + constants[j].radius + skin
+                if dx * dx + dy * dy <= distance * distance:
+                    if kept < room:
+                        pairs.found[first + kept] = i << np.uint32(16) | j
+                    kept += 1
+    return kept
+
+
+@njit
+def _sort_into_cells(team, motion, pairs, side, tilt, rows, columns):
+    """Sort the grains by cell, those of a cell in their order: the grains that the lanes have at
+    once are counted by comparing their cells.
+    """
+    starts, cells, order, ranks = pairs.starts, pairs.cells, pairs.sorted, pairs.listed
+    count, cell_count = motion.size, rows * columns
+    for cell in shared_out(team, cell_count + 1):
+        starts[cell] = 0
+    sync()
+    for first in in_turns(team, count):
+        (g, here), cell, same = own_index(team, first, count), cell_count, np.uint64(0)
+        if here:
+            cell = cell_of(motion[g].x, motion[g].y, side, tilt, rows, columns)
+        for n in range(lanes_in_turn(team, first, count)):
+            same |= np.uint64(of_lane(team, cell, n) == cell) << n
+        before = bits_of(same & lower_lanes(team))
+        if here:
+            cells[g], ranks[g] = cell, starts[cell + 1] + before
+        sync()
+        if here and before == 0:
+            starts[cell + 1] += bits_of(same)
+        sync()
+    filled = 0
+    for first in in_turns(team, cell_count):
+        cell, here = own_index(team, first, cell_count)
+        size = np.int64(starts[cell + 1]) if here else 0
+        before, of_turn = before_and_total(team, size)
+        if here:
+            starts[cell + 1] = filled + before + size
+        filled += of_turn
+    sync()
+    for g in shared_out(team, count):
+        order[starts[cells[g]] + ranks[g]] = g
+    sync()
 
 
 @njit
@@ -301,20 +376,31 @@ def _next_contact_step(team, count, pairs):
 @njit
 def _contacts_of_step(team, k, count, pairs, network):
     """Write the pairs that are contacts in a step; returns their number."""
-    calendar, keys = pairs.calendar, pairs.of_grain
-    for p in shared_out(team, count):
-        keys[p] = (calendar[BEGINS, p] <= k) & (k <= calendar[ENDS, p])
-    return indices_of(team, keys, 1, count, network.near_pair, 0)
+    calendar, listed, found = pairs.calendar, network.near_pair, 0
+    for first in in_turns(team, count):
+        p, here = own_index(team, first, count)
+        wanted = here and calendar[BEGINS, p] <= k and k <= calendar[ENDS, p]
+        place, found = place_in_list(team, wanted, found)
+        if wanted and place < listed.size:
+            listed[place] = p
+    sync()
+    return found
 
 
 @njit
 def _struck_pairs(team, k, count, pairs, loaded):
     """List the pairs to be predicted anew: those of struck grains, and those that were due."""
-    calendar, ends, keys = pairs.calendar, pairs.ends, pairs.of_grain
-    for p in shared_out(team, count):
-        struck = loaded[ends[FIRST, p]] + loaded[ends[SECOND, p]] > 0
-        keys[p] = struck | (calendar[STRIKES, p] <= k)
-    return indices_of(team, keys, 1, count, pairs.listed, 0)
+    calendar, ends, found = pairs.calendar, pairs.ends, 0
+    for first in in_turns(team, count):
+        p, wanted = own_index(team, first, count)
+        if wanted:
+            struck = loaded[ends[FIRST, p]] + loaded[ends[SECOND, p]] > 0
+            wanted = struck or calendar[STRIKES, p] <= k
+        place, found = place_in_list(team, wanted, found)
+        if wanted:
+            pairs.listed[place] = p
+    sync()
+    return found
 
 
 @njit

@@ -21,7 +21,7 @@ from jaxgran.dynamics.tally import NUMBERS
 
 PAIRS_PER_GRAIN = 16  # capacity
 MOST_COLOURS = 32
-_PER_GRAIN = sum(x.itemsize for x in (MOTION, CONSTANTS)) + 4 + 4 + 16 + 24  # bytes
+_PER_GRAIN = sum(x.itemsize for x in (MOTION, CONSTANTS)) + 4 + 4 + 16 + 24 + 4 * 4  # bytes
 _PER_PAIR = 2 * 4 + 2 * 8 + 3 * 4 + 4 + 2 * 4
 _PER_CONTACT = 4 + 2 * 4 + 5 * 8 + 4 + 4 + 2 * 4 + CONTACT.itemsize + ITERATE.itemsize
 _PADDING = 8 * 32  # of arrays that end within a word
@@ -35,15 +35,16 @@ class Grains(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """As in ``numba_engine.arrays``; of_grain has the pairs found by each lane, and then a key of
-    each pair.
-    """
+    """As in ``numba_engine.arrays``; found has the pairs that each lane has found in a search."""
 
     ends: Any
     images: Any
     calendar: Any
     listed: Any
-    of_grain: Any
+    found: Any
+    starts: Any
+    cells: Any
+    sorted: Any
 
 
 class Network(NamedTuple):
@@ -106,7 +107,7 @@ def array_at(address, shape, dtype):
 def words_needed(grains: int, lanes: int) -> int:
     """The words of eight bytes of one replica, with the slots of its team."""
     per_grain = _PER_GRAIN + PAIRS_PER_GRAIN * _PER_PAIR + 3 * _PER_CONTACT
-    return lanes * (2 + NUMBERS) + (per_grain * grains + 4 * MOST_COLOURS + _PADDING) // 8
+    return lanes * NUMBERS + (per_grain * grains + 4 * MOST_COLOURS + _PADDING) // 8
 
 
 @njit
@@ -121,7 +122,10 @@ def memory_at(address, grains, lanes):
     images, address = array_at(address, (2, slots), np.float64)
     calendar, address = array_at(address, (3, slots), np.int32)
     listed, address = array_at(address, slots, np.uint32)
-    of_grain, address = array_at(address, 2 * slots, np.uint32)
+    found, address = array_at(address, 2 * slots, np.uint32)
+    starts, address = array_at(address, max(9, 2 * count) + 1, np.uint32)
+    cells, address = array_at(address, count, np.uint32)
+    in_cells, address = array_at(address, count, np.uint32)
     near_pair, address = array_at(address, contacts, np.uint32)
     contact_ends, address = array_at(address, (2, contacts), np.uint32)
     rows, address = array_at(address, (5, contacts), np.float64)
@@ -137,7 +141,7 @@ def memory_at(address, grains, lanes):
     matrices, address = array_at(address, (count, 3), np.float64)
     memory = Memory(
         Grains(motion, constants),
-        Pairs(ends, images, calendar, listed, of_grain),
+        Pairs(ends, images, calendar, listed, found, starts, cells, in_cells),
         Network(near_pair, contact_ends, rows, loaded, impulses, colours, colour),
         Clusters(source, starts, solver_ends, solver_rows, iterate, impulses, matrices),
         sums,
