@@ -34,6 +34,7 @@ from jaxgran.sampling.observe import advance_batch
 POINTS = ((0.9, 0.56), (0.5, 0.7), (0.5, 0.8))
 BATCHES = ((1000, 256, 1e-3), (1000, 256, 1e-4))  # replicas, grains, time step
 ACCELERATOR_BATCHES = ((1, 100_000, 1e-3), (16_000, 256, 1e-3), (16_000, 256, 1e-4))
+NUMBA_BATCHES = ((1000, 64, 1e-3), (16_000, 64, 1e-3), (1000, 1024, 1e-3), (16_000, 1024, 1e-3))
 STRAIN = 0.2
 DISTINCT, APART = 16, 0.5  # states of a batch, and the strain between them
 TURNS, ENOUGH_SECONDS = 3, 60
@@ -42,7 +43,9 @@ TURNS, ENOUGH_SECONDS = 3, 60
 def run(output: Output, engine: Literal["auto", "numba"] = "auto") -> None:
     """Compare every batch at every point, print, and write JSON after each."""
     numerics = Numerics(engine=engine_named(engine))
-    batches, points = BATCHES + (() if on_processor() else ACCELERATOR_BATCHES), POINTS
+    batches, points = BATCHES, POINTS
+    if not on_processor():
+        batches += ACCELERATOR_BATCHES + NUMBA_BATCHES * (engine == "numba")
     if engine == "numba":
         batches = tuple(batch for batch in batches if batch[1] <= MOST_GRAINS)
     if output.quick:

@@ -173,6 +173,7 @@ def test_the_kernel_needs_nothing_but_the_device() -> None:
     """PTX without calls of other functions; where there is an assembler, it takes it."""
     code = linking.ptx()
     assert f".visible .entry {layout.KERNEL}" in code and code.count("bar.warp.sync") > 20
+    assert code.count("shfl.sync.idx.b32") > 20 and "vote.sync.ballot.b32" in code
     assert ".extern" not in code and "call" not in code.replace("call_", "")
     from importlib.util import find_spec
 

@@ -296,17 +296,18 @@ def _find_near_pairs(team, grains, pairs, side, tilt, reach, skin, first, room):
     for m in shared_out(team, motion.size):
         i = order[m] if rows > 0 else np.uint32(m)
         cell = np.int64(pairs.cells[i]) if rows > 0 else 0
+        x, y, radius_and_skin = motion[i].x, motion[i].y, constants[i].radius + skin
         for part in range(4 if rows > 0 else 1):
             begin, end, column, row = 0, motion.size, 0, 0
             if rows > 0:
                 begin, end, column, row = stretch_of(part, cell, rows, columns, pairs.starts)
             for n in range(m + 1 if part == 0 else np.uint64(begin), np.uint64(end)):
                 j = order[n] if rows > 0 else np.uint32(n)
-                dx, dy = motion[i].x - motion[j].x, motion[i].y - motion[j].y
+                dx, dy = x - motion[j].x, y - motion[j].y
                 if rows == 0:
                     column, row = nearest_image(dx, dy, side, tilt)
                 dx, dy = dx - (column * side + row * tilt * side), dy - row * side
-                distance = constants[i].radius + constants[j].radius + skin
+                distance = radius_and_skin + constants[j].radius
                 if dx * dx + dy * dy <= distance * distance:
                     if kept < room:
                         pairs.found[first + kept] = i << np.uint32(16) | j
