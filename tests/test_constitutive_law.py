@@ -122,7 +122,7 @@ def test_the_range_ends_where_it_says() -> None:
         with pytest.raises(jg.InputError, match="the range of the reference map"):
             LAW(alpha, nu)
         assert np.all(np.isnan(jax.jit(LAW)(alpha, nu)))
-    for rate in (0.0, -1.0, "1"):
+    for rate in (0.0, -1.0, np.inf, "1"):
         with pytest.raises(jg.InputError, match="shear_rate must be a positive number"):
             LAW(0.5, 0.5, rate)
     with jax.enable_x64(False), pytest.raises(jg.InputError, match="double precision"):

@@ -166,8 +166,10 @@ REFUSED: dict[str, Any] = {
         lambda x: [with_other("code_digest", of_seeds(x, 0, 1)), of_seeds(x, 1, 1)]
     ),
     "must have the group sums": lambda x: [of_seeds({}, 0, 1)],
+    "averages of them do not": lambda x: [of_seeds(x, 0, 1).mean()],
     "the running sums of this version": lambda x: [without_a_sum(of_seeds(x, 0, 1))],
-    "a list of at least one map or file, not 'map.nc'": lambda _: "map.nc",
+    "at least one map, a DataTree, or file, not str": lambda _: "map.nc",
+    r"or file, not \['Dataset'\]": lambda x: [of_seeds(x, 0, 1).to_dataset()],
 }
 
 

@@ -123,8 +123,11 @@ def _with_all_axes(data: xr.DataTree) -> xr.Dataset:
     the seeds.
     """
     flat = flattened(data)
-    if "sums/tally" not in flat:
-        raise InputError("data must have the group sums, which maps of this version have.")
+    if "sums/tally" not in flat or "seed" not in flat.dims:
+        raise InputError(
+            "data must have the group sums with its seeds, which maps of this version have, and "
+            "averages of them do not."
+        )
     if "grains" not in flat.coords:  # a map that has another number at each point
         flat = flat.assign_coords(grains=0).reset_coords("point_grains")
     whole: Any = flat[[x for x in flat.data_vars if str(x).startswith(_READ)]]

@@ -115,7 +115,7 @@ class ConstitutiveLaw:
             γ̇ is not positive; or JAX traces a value without ``jax_enable_x64``.
         """
         shear_rate = as_array(shear_rate)
-        require("shear_rate", shear_rate, lambda x: x > 0, "a positive number")
+        require("shear_rate", shear_rate, lambda x: (x > 0) & (x < np.inf), "a positive number")
         *_, averages = over_range(self.table, self._at_unit_rate, restitution, packing_fraction)
         xp, shape = module_of(restitution, packing_fraction, shear_rate), np.shape(shear_rate)
         try:
