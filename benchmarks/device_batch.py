@@ -1,11 +1,12 @@
 """Batches of replicas on the device that JAX finds, beside one core of the numba rival.
 
-Replicas of 256 grains are advanced from the same states by what jaxgran takes for this device and,
+Replicas are advanced from the same states by what jaxgran takes for this device and,
 a few of them, by the rival. Replica-steps per second are printed and written as JSON, with the
 pressure against that of the rival and the peak of the device's memory where it tells. Where the
 replicas advance in lockstep their number decides the speed, so it is raised, and one large flow is
 advanced as well. States are prepared on the processor. With ``--engine numba`` a device takes the
-numba engine, whose calls must repeat to the bit.
+numba engine, whose calls must repeat to the bit, also at 64 and 1024 grains; the last of its
+batches needs some 25 GB.
 
     python -m benchmarks device_batch           # a processor: 2 minutes
     python -m benchmarks device_batch --quick   # under a minute
@@ -26,7 +27,6 @@ from benchmarks.independent import contact_dynamics
 from benchmarks.output import Output
 from benchmarks.step_cost import rival_arguments
 from jaxgran.dynamics.engine import Numerics, engine_named, select_engine
-from jaxgran.dynamics.numba_engine.team.handler import MOST_GRAINS
 from jaxgran.environment import on_processor
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.observe import advance_batch
@@ -46,8 +46,6 @@ def run(output: Output, engine: Literal["auto", "numba"] = "auto") -> None:
     batches, points = BATCHES, POINTS
     if not on_processor():
         batches += ACCELERATOR_BATCHES + NUMBA_BATCHES * (engine == "numba")
-    if engine == "numba":
-        batches = tuple(batch for batch in batches if batch[1] <= MOST_GRAINS)
     if output.quick:
         batches, points = ((64, 256, 1e-3),), POINTS[:2]
     device = jax.local_devices()[0]

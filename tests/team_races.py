@@ -1,12 +1,15 @@
 """Runs the loop of the team uncompiled, one thread for each lane, and finds what lanes do to each
-other: ``NUMBA_DISABLE_JIT=1 python team_races.py STATE.npz LANES [WITHOUT]``, without the barriers
-of a function.
+other: ``NUMBA_DISABLE_JIT=1 python team_races.py STATE.npz LANES NUMBERS``, with numbers of the
+source to replace, as JSON.
 
-Between two barriers an element that one lane writes may not be touched by another one, unless all
-write the same; what lanes exchange without memory is no barrier. All lanes must come to the same
-barrier or exchange by the same calls. Prints the number of barriers, and what is wrong.
+Between two barriers an element that one lane writes may not be read by another one, nor written by
+another one unless both write the same without a look at it; what lanes exchange without memory is
+no barrier. All lanes must come to the same barrier or exchange by the same calls. Prints, as JSON,
+the number of barriers, what is wrong, and the barriers in the source that may be left out one by
+one without a fault.
 """
 
+import json
 import sys
 import threading
 from collections import defaultdict
@@ -16,17 +19,17 @@ from typing import Any
 import numpy as np
 
 from jaxgran.dynamics.numba_engine import layout
-from jaxgran.dynamics.numba_engine.arrays import CONSTANTS, CONTACT, ITERATE, MOTION
-from jaxgran.dynamics.numba_engine.team import contacts, lanes, loop
-from jaxgran.dynamics.numba_engine.team.memory import Clusters, Grains, Memory, Network, Pairs
-from jaxgran.dynamics.tally import NUMBERS
+from jaxgran.dynamics.numba_engine.team import contacts, lanes, loop, memory
+
+TEAM = (lanes, loop, contacts, memory)
+Site = tuple[str, int]  # function and line of a barrier
 
 lane_here = threading.local()
 reads: dict[Any, set[int]] = defaultdict(set)
 writes: dict[Any, dict[int, Any]] = defaultdict(dict)
-sites: dict[int, tuple] = {}
+sites: dict[int, list[Site]] = {}
+barriers: list[Site] = []
 wrong: set[str] = set()
-barriers = 0
 
 
 class Watched:
@@ -74,75 +77,79 @@ class Row:
 
 def replace(**others: Any) -> None:
     """Replace what is compiled for a device, and numbers."""
-    for module in (lanes, loop, contacts):
+    for module in TEAM:
         for name, other in others.items():
             setattr(module, name, other)
 
 
+def watched(shape: Any, dtype: Any, name: str = "") -> Watched:
+    array = np.zeros(shape, dtype)
+    array.view(np.uint8)[...] = 0x7F  # not initialised
+    return Watched(array, name)
+
+
+def memory_of(count: int, count_of_lanes: int) -> Any:
+    """The memory of a replica, with the names of its arrays."""
+    replace(array_at=lambda address, shape, dtype: (watched(shape, dtype), address))
+    made, _ = memory.memory_at(0, count, count_of_lanes)
+    made.sums.name = "sums"
+    for part in made[:-1]:
+        for name, array in part._asdict().items():
+            array.name = f"{type(part).__name__}.{name}"
+    return made
+
+
+def note(problem: str) -> None:
+    """Note what is wrong, in the thread of one lane while all are at a barrier, and end the run."""
+    wrong.add(problem)
+    raise RuntimeError(problem)
+
+
 def compare_sites() -> None:
-    """Called by one lane, while all are at a barrier or an exchange."""
-    if len(set(sites.values())) > 1:
-        wrong.add(f"lanes wait at different places: {set(sites.values())}")
+    if len(set(map(tuple, sites.values()))) > 1:
+        note(f"lanes wait at different places: {sites}")
 
 
 def compare() -> None:
-    """Called by one lane, while all are at a barrier."""
-    global barriers
-    barriers += 1
     compare_sites()
+    barriers.append(sites[0][0])
     for element, by_lane in writes.items():
+        readers = reads.get(element, set())
+        several = len(by_lane) > 1
         differ = len({repr(x) for x in by_lane.values()}) > 1
-        if differ or reads.get(element, set()) - set(by_lane):
-            where = next(iter(sites.values()))[0]
-            wrong.add(f"{element[0]} is written and touched by others before line {where}")
+        if differ or readers - set(by_lane) or (several and readers):
+            note(f"{element[0]} is written and touched by others before {sites[0]}")
     reads.clear()
     writes.clear()
 
 
-def fill_the_room() -> None:
-    """More contacts are wanted than there is room for; no lane may write beyond it."""
-    replace(sync=lambda: None, ballot=lambda team, agrees: np.uint64(agrees))
-    written = np.zeros(3, np.int64)
-    pairs = SimpleNamespace(calendar=np.array([[0] * 5, [0] * 5, [9] * 5]))
-    network = SimpleNamespace(near_pair=written)
-    alone = lanes.Team(np.uint64(0), np.uint64(1))
-    try:
-        found = loop._contacts_of_step(alone, 1, 5, pairs, network)
-    except IndexError as problem:
-        wrong.add(f"beyond the room: {problem}")
-    else:
-        if found != 5 or written.tolist() != [0, 1, 2]:
-            wrong.add(f"{found} indices are found and {written} written")
-
-
-def main(file: str, count_of_lanes: int, without: str = "") -> None:
-    fill_the_room()
-    given = np.load(file)
+def advanced(given: Any, count_of_lanes: int, left_out: Site | None = None) -> np.ndarray:
+    """Positions after a run without one of the barriers; what is wrong is noted."""
+    for kept in (reads, writes, sites, barriers, wrong):
+        kept.clear()
     meeting = threading.Barrier(count_of_lanes, action=compare)
     exchange = threading.Barrier(count_of_lanes, action=compare_sites)
     words: list[Any] = [None] * count_of_lanes
 
-    def note_site() -> bool:
-        """Note the calls of this lane; returns whether they are to be left out."""
-        frame: Any = sys._getframe(2)
-        left_out, calls = frame.f_code.co_name == without, []
-        while frame.f_code.co_name != "run":
-            calls.append(frame.f_lineno)
+    def note_site() -> Site:
+        frame, calls = sys._getframe(2), []
+        while frame is not None and frame.f_code.co_name != "run":
+            calls.append((frame.f_code.co_name, frame.f_lineno))
             frame = frame.f_back
-        sites[lane_here.number] = tuple(calls)
-        return left_out
+        sites[lane_here.number] = calls
+        return calls[0]
 
     def sync() -> None:
-        if not note_site():
+        if note_site() != left_out:
             meeting.wait(60)
 
     def words_of_all(word: Any) -> list[Any]:
         note_site()
         words[lane_here.number] = word
         exchange.wait(60)
-        given = list(words)
+        of_all = list(words)
         exchange.wait(60)
-        return given
+        return of_all
 
     def of_lane(team, number, lane):
         return words_of_all(number)[int(lane)]
@@ -150,89 +157,81 @@ def main(file: str, count_of_lanes: int, without: str = "") -> None:
     def ballot(team, agrees) -> np.uint64:
         return np.uint64(sum(bool(x) << n for n, x in enumerate(words_of_all(agrees))))
 
-    def add_terms(sums, first, terms) -> None:
-        for n, term in enumerate(terms):
-            sums[first + n] += term
-
-    replace(sync=sync, of_lane=of_lane, ballot=ballot, _add_terms=add_terms)
-    count = len(given["radii"])
-    slots, most = 16 * count, 3 * count
-
-    def watched(name: str, shape: Any, dtype: Any) -> Watched:
-        array = np.zeros(shape, dtype)
-        array.view(np.uint8)[...] = 0x7F  # not initialised
-        return Watched(array, name)
-
-    u4, i4, f8 = np.uint32, np.int32, np.float64
-    impulses = watched("impulses", (count, 2), f8)
-    memory = Memory(
-        Grains(watched("motion", count, MOTION), watched("constants", count, CONSTANTS)),
-        Pairs(
-            watched("pair ends", (2, slots), u4),
-            watched("images", (2, slots), f8),
-            watched("calendar", (3, slots), i4),
-            watched("listed", slots, u4),
-            watched("found", 2 * slots, u4),
-            watched("starts", max(9, 2 * count) + 1, u4),
-            watched("cells", count, u4),
-            watched("sorted", count, u4),
-        ),
-        Network(
-            watched("near_pair", most, u4),
-            watched("contact ends", (2, most), u4),
-            watched("contact rows", (5, most), f8),
-            watched("loaded", count, i4),
-            impulses,
-            watched("colours", count, u4),
-            watched("colour", most, u4),
-        ),
-        Clusters(
-            watched("source", most, u4),
-            watched("starts", 33, u4),
-            watched("solver ends", (most, 2), u4),
-            watched("solver rows", most, CONTACT),
-            watched("iterate", most, ITERATE),
-            impulses,
-            watched("matrices", (count, 3), f8),
-        ),
-        watched("sums", (count_of_lanes, NUMBERS), f8),
-    )
-    steps = given["steps"]
-    inputs = layout.Inputs(*given["inputs"])
-    new = [watched("new positions", (count, 2), f8), watched("new velocities", (count, 2), f8)]
-    results = watched("results", (steps.size, layout.RESULTS), f8)
+    replace(sync=sync, of_lane=of_lane, ballot=ballot)
+    count, steps = len(given["radii"]), given["steps"]
+    of_replica = memory_of(count, count_of_lanes)
+    new = [watched((count, 2), float, name) for name in ("new positions", "new velocities")]
+    results = watched((steps.size, layout.RESULTS), float, "results")
 
     def run(number: int) -> None:
         lane_here.number = number
-        arrays = (given[x] for x in ("positions", "velocities", "radii", "masses"))
         try:
             loop.advance_team(
                 lanes.Team(np.uint64(number), np.uint64(count_of_lanes)),
-                *arrays,
-                inputs,
+                *(given[x] for x in ("positions", "velocities", "radii", "masses")),
+                layout.Inputs(*given["inputs"]),
                 steps,
                 given["begin"],
                 *new,
                 results,
-                memory,
+                of_replica,
             )
+        except threading.BrokenBarrierError:
+            pass
         except BaseException as problem:
             wrong.add(f"lane {number}: {problem!r}")
             meeting.abort()
             exchange.abort()
-            raise
 
     threads = [threading.Thread(target=run, args=(n,)) for n in range(count_of_lanes)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    np.savez(file.replace(".npz", "_end.npz"), results=results.array, positions=new[0].array)
-    print(barriers, *sorted(wrong), sep="\n")
+    return new[0].array
+
+
+def fill_the_room() -> list[int]:
+    """More contacts are wanted than there is room for; no lane may write beyond it."""
+    replace(sync=lambda: None, ballot=lambda team, agrees: np.uint64(agrees))
+    written = np.zeros(3, np.int64)
+    pairs = SimpleNamespace(calendar=np.array([[0] * 5, [0] * 5, [9] * 5]))
+    network = SimpleNamespace(near_pair=written)
+    alone = lanes.Team(np.uint64(0), np.uint64(1))
+    found = loop._contacts_of_step(alone, 1, 5, pairs, network)
+    return [found, *written.tolist()]
+
+
+def add_terms(sums, first, terms) -> None:
+    for n, term in enumerate(terms):
+        sums[first + n] += term
+
+
+def main(file: str, count_of_lanes: int, numbers: dict[str, int]) -> None:
+    replace(bits_of=lambda word: int(word).bit_count(), _add_terms=add_terms)
+    room = fill_the_room()
+    replace(**numbers)
+    given = dict(np.load(file))
+    positions = advanced(given, count_of_lanes).tolist()
+    found, places, needless = sorted(wrong), list(barriers), []
+    for place in sorted(set(places)):
+        advanced(given, count_of_lanes, left_out=place)
+        if not wrong:
+            needless.append(place)
+    print(
+        json.dumps(
+            {
+                "barriers": len(places),
+                "places": sorted(set(places)),
+                "wrong": found,
+                "needless": needless,
+                "positions": positions,
+                "room": room,
+            }
+        )
+    )
 
 
 if __name__ == "__main__":
     np.seterr(all="ignore")
-    # few sweeps, so that the method that follows them is needed
-    replace(bits_of=lambda word: int(word).bit_count(), SWEEPS=3)
-    main(sys.argv[1], int(sys.argv[2]), *sys.argv[3:])
+    main(sys.argv[1], int(sys.argv[2]), json.loads(sys.argv[3]))

@@ -25,7 +25,7 @@ from jaxgran.contact.projected_methods import (
 from jaxgran.dynamics.batching import with_forward_derivative, with_own_batching
 from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.dynamics.numba_engine.observed import advance_by_numba
-from jaxgran.dynamics.numba_engine.team.handler import MOST_GRAINS, has_cuda
+from jaxgran.dynamics.numba_engine.team.handler import has_cuda
 from jaxgran.dynamics.observer import Observe, uses_traced_values
 from jaxgran.dynamics.tally import Tally
 from jaxgran.environment import default_device, on_processor, precision
@@ -116,9 +116,9 @@ class Numba:
     environment variable ``NUMBA_NUM_THREADS`` sets their number. ``jax.lax.map`` takes one at a
     time. Derivatives in forward mode, and the values beside them, are those of ``Jax``.
 
-    On a CUDA device a warp advances each replica of a batch, without records for ``observe``, up to
-    65,535 grains. Its code has been run on processors only, by one lane and by 32, and no device
-    has run it yet: there it must be asked for.
+    On a CUDA device a warp advances each replica of a batch, without records for ``observe``, and
+    solves all contacts that touch others together. Its code has been run on processors only, by one
+    lane and by 32, and no device has run it yet: there it must be asked for.
 
     Examples:
       >>> Numba()
@@ -151,16 +151,10 @@ class Numba:
         """As ``Jax.advance``; the list of near pairs outlives a block, where nothing is
         observed.
         """
-        if not on_processor():
-            if observe is not None:
-                raise InputError(
-                    "engine numba observes on a processor only: take jg.Jax() on a device."
-                )
-            if flow.grains > MOST_GRAINS:
-                raise InputError(
-                    f"engine numba takes at most {MOST_GRAINS} grains on a device, not "
-                    f"{flow.grains}: take jg.Jax()."
-                )
+        if not on_processor() and observe is not None:
+            raise InputError(
+                "engine numba observes on a processor only: take jg.Jax() on a device."
+            )
         run = partial(advance_by_numba, observe=observe)
         differentiable = partial(advance_by_jax, observe=observe)
         return with_forward_derivative(run, differentiable)(flow, solver, state, steps)

@@ -25,6 +25,8 @@ _INLINED: dict[str, Any] = {
     "_nrt": False,  # private; references to arrays are not counted, which makes the engine faster
 }
 njit: Callable[[Callable], Any] = numba.njit(**OPTIONS, **_INLINED)
+# without fused operations
+njit_plain: Callable[[Callable], Any] = numba.njit(**OPTIONS | {"fastmath": False}, **_INLINED)
 
 
 @njit

@@ -97,7 +97,6 @@ def collide(team, contacts, t, flow, grains, pairs, network, clusters, sums):
             g = network.ends[end, c]
             impulses[g, 0] = impulses[g, 1] = 0.0
     _, approaching = before_and_total(team, own_approaching)
-    sync()
     most, all_coloured = _colour(team, contacts, network)
     coupled = _isolate_and_sort(team, contacts, most, grains, network, clusters)
     iterations, residual, status = 1, 0.0, OK
@@ -117,7 +116,6 @@ def collide(team, contacts, t, flow, grains, pairs, network, clusters, sums):
         add_solve(sums, iterations, residual, status, 0.0)
     for c in shared_out(team, contacts):
         _add_terms(sums, FIRST_TERM, terms_of(c, flow.one_plus_alpha, grains, network))
-    sync()
     return approaching, status
 
 

@@ -17,7 +17,6 @@ import jax
 from jaxgran.dynamics.numba_engine import ffi, layout
 from jaxgran.files import atomic_write, file_lock
 
-MOST_GRAINS = 2**16 - 1  # both ends of a near pair found in a search are in 32 bits
 _API, _CONTEXT, _ARGS, _RETS = 2, 3, 9, 14  # words of a call frame
 _ERROR_CREATE, _STREAM_GET = 6, 10  # words of the table of XLA's functions
 _METADATA_EXTENSION, _INTERNAL_ERROR = 1, 13

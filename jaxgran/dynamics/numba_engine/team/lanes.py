@@ -19,7 +19,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from jaxgran.dynamics.numba_engine.compilation import njit
+from jaxgran.dynamics.numba_engine.compilation import njit, njit_plain
 
 # Functions that a target defines: nothing; a word of this lane, and the lane whose word is wanted;
 # whether this lane agrees. Each but the first is given the number of this lane first.
@@ -85,6 +85,14 @@ def bits_of(context, word):
         return builder.ctpop(arguments[0])
 
     return types.int64(types.uint64), generate
+
+
+@njit_plain
+def plain_sum(one, other):
+    """A sum that is not fused with a product before it: lanes that add each other's numbers must
+    find the same bits.
+    """
+    return one + other
 
 
 @njit
@@ -167,7 +175,7 @@ def sum_of(team, number):
     """The sum of a real number over the lanes."""
     step = team.lanes >> np.uint64(1)
     while step > 0:
-        number += of_lane(team, number, team.lane ^ step)
+        number = plain_sum(number, of_lane(team, number, team.lane ^ step))
         step >>= np.uint64(1)
     return number
 

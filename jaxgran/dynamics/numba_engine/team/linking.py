@@ -1,10 +1,10 @@
 """From the source of the team's loop to machine code.
 
 numba compiles the loop once to LLVM's language, and leaves it as it is: what it would do for this
-processor is wrong for a device. An entry is linked to it that brings the barrier, the mathematical
-functions for which every target has an instruction, and the kernel itself. LLVM's backend for
-NVIDIA devices is part of llvmlite, on which numba depends, and the driver assembles the PTX, so
-nothing else needs to be installed.
+processor is wrong for a device. An entry is linked to it that brings the barrier, what lanes
+exchange, the mathematical functions for which every target has an instruction, and the kernel.
+LLVM's backend for NVIDIA devices is part of llvmlite, on which numba depends, and the driver
+assembles the PTX, so nothing else needs to be installed.
 """
 
 import os

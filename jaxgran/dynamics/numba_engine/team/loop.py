@@ -1,7 +1,7 @@
 """The time loop of a team: the steps, the calendar and the sums of ``numba_engine.loop``.
 
 It differs in how the work is shared out. Every pass over grains, pairs or contacts is strided over
-the lanes. A list is filled by counting, adding up over the lanes, and writing. The running sums are
+the lanes. What a lane adds to a list stands behind that of lower lanes. The running sums are
 private to each lane until a block ends. All lanes hold the same numbers of the flow, so they take
 the same branches, and meet at every barrier.
 """
@@ -54,6 +54,7 @@ from jaxgran.dynamics.numba_engine.near_pairs import (
 from jaxgran.dynamics.numba_engine.sums import add_flight
 from jaxgran.dynamics.numba_engine.team.contacts import collide, strike
 from jaxgran.dynamics.numba_engine.team.lanes import (
+    ballot,
     before_and_total,
     bits_of,
     in_turns,
@@ -158,7 +159,6 @@ def advance_team(
         valid = min(slack / closing_speed if closing_speed > 0.0 else math.inf, life)
         for p in shared_out(team, pair_count):
             pairs.listed[p] = p
-        sync()
         _predict(team, pair_count, 0.0, solved, max(valid, dt) + look_ahead, flow, grains, pairs)
 
         while True:
@@ -218,7 +218,6 @@ def advance_team(
 
         steps_before_list += k
         tilt = remap_tilt(tilt + shear_rate * k * dt)
-        sync()
         for g in shared_out(team, count):
             move_grain(g, k * dt, grains)
 
@@ -256,63 +255,60 @@ def _search(team, grains, pairs, side, tilt, largest_diameter, skin):
     """List the near pairs, with ever narrower skins while there is no room for them; returns their
     number, the skin, and whether there was room.
     """
-    motion, found = grains.motion, pairs.found
-    capacity, room = pairs.listed.size, found.size // np.int64(team.lanes)
-    first = np.int64(team.lane) * room
-    kept = before = total = 0
-    fits = False
+    capacity, found = pairs.listed.size, 0
     for _ in range(ATTEMPTS):
-        kept = _find_near_pairs(
-            team, grains, pairs, side, tilt, largest_diameter + skin, skin, first, room
-        )
-        spare = least(team, room - kept)
-        before, total = before_and_total(team, kept)
-        fits = spare >= 0 and total <= capacity
-        if fits:
+        reach = largest_diameter + skin
+        found = _find_near_pairs(team, grains, pairs, side, tilt, reach, skin, capacity)
+        if found <= capacity:
             break
         skin *= 0.7
-    for n in range(kept if fits else 0):
-        i = np.int64(found[first + n] >> np.uint32(16))
-        j = np.int64(found[first + n] & np.uint32(0xFFFF))
-        dx, dy = motion[i].x - motion[j].x, motion[i].y - motion[j].y
-        column, row = nearest_image(dx, dy, side, tilt)
-        p = before + n
-        pairs.ends[FIRST, p], pairs.ends[SECOND, p] = i, j
-        pairs.images[IMAGE_X, p] = column * side + row * tilt * side
-        pairs.images[IMAGE_ROW, p] = row
-    return total if fits else 0, skin, fits
+    return min(found, capacity), skin, found <= capacity
 
 
 @njit
-def _find_near_pairs(team, grains, pairs, side, tilt, reach, skin, first, room):
-    """Write this lane's pairs with a gap within the skin from ``found[first]`` on, as far as there
-    is room; returns how many there are. Without a grid all pairs are compared.
+def _find_near_pairs(team, grains, pairs, side, tilt, reach, skin, capacity):
+    """Write the pairs with a gap within the skin, and their images; pairs beyond the capacity are
+    counted, not written. Each lane takes a grain, and compares it with those of half of the cells
+    around; all with those behind it where there is no grid.
     """
     motion, constants, order = grains.motion, grains.constants, pairs.sorted
+    ends, images, found, count = pairs.ends, pairs.images, 0, motion.size
     rows, columns = grid_of(reach, side, tilt, pairs.starts.size - 1)
     if rows > 0:
         _sort_into_cells(team, motion, pairs, side, tilt, rows, columns)
-    kept = 0
-    for m in shared_out(team, motion.size):
-        i = order[m] if rows > 0 else np.uint32(m)
-        cell = np.int64(pairs.cells[i]) if rows > 0 else 0
-        x, y, radius_and_skin = motion[i].x, motion[i].y, constants[i].radius + skin
+    for first in in_turns(team, count):
+        m, here = own_index(team, first, count)
+        i, cell = np.uint32(m), 0
+        if here and rows > 0:
+            i = order[m]
+            cell = np.int64(pairs.cells[i])
+        x, y, radius_and_skin = 0.0, 0.0, 0.0
+        if here:
+            x, y, radius_and_skin = motion[i].x, motion[i].y, constants[i].radius + skin
         for part in range(4 if rows > 0 else 1):
-            begin, end, column, row = 0, motion.size, 0, 0
+            begin, end, column, row = 0, count, 0, 0
             if rows > 0:
                 begin, end, column, row = stretch_of(part, cell, rows, columns, pairs.starts)
-            for n in range(m + 1 if part == 0 else np.uint64(begin), np.uint64(end)):
-                j = order[n] if rows > 0 else np.uint32(n)
-                dx, dy = x - motion[j].x, y - motion[j].y
-                if rows == 0:
-                    column, row = nearest_image(dx, dy, side, tilt)
-                dx, dy = dx - (column * side + row * tilt * side), dy - row * side
-                distance = radius_and_skin + constants[j].radius
-                if dx * dx + dy * dy <= distance * distance:
-                    if kept < room:
-                        pairs.found[first + kept] = i << np.uint32(16) | j
-                    kept += 1
-    return kept
+            n, end = m + np.uint64(1) if part == 0 else np.uint64(begin), np.uint64(end)
+            image_x, image_row = (column + row * tilt) * side, float(row)
+            while ballot(team, here and n < end) > 0:
+                j, is_near = np.uint32(n), False
+                if here and n < end:
+                    j = order[n] if rows > 0 else j
+                    dx, dy = x - motion[j].x, y - motion[j].y
+                    if rows == 0:
+                        nearest_column, image_row = nearest_image(dx, dy, side, tilt)
+                        image_x = nearest_column * side + image_row * tilt * side
+                    dx, dy = dx - image_x, dy - image_row * side
+                    distance = radius_and_skin + constants[j].radius
+                    is_near = dx * dx + dy * dy <= distance * distance
+                p, found = place_in_list(team, is_near, found)
+                if is_near and p < capacity:
+                    ends[FIRST, p], ends[SECOND, p] = i, j
+                    images[IMAGE_X, p], images[IMAGE_ROW, p] = image_x, image_row
+                n += np.uint64(1)
+    sync()
+    return found
 
 
 @njit

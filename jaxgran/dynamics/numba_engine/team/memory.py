@@ -22,7 +22,7 @@ from jaxgran.dynamics.tally import NUMBERS
 PAIRS_PER_GRAIN = 16  # capacity
 MOST_COLOURS = 32
 _PER_GRAIN = sum(x.itemsize for x in (MOTION, CONSTANTS)) + 4 + 4 + 16 + 24 + 4 * 4  # bytes
-_PER_PAIR = 2 * 4 + 2 * 8 + 3 * 4 + 4 + 2 * 4
+_PER_PAIR = 2 * 4 + 2 * 8 + 3 * 4 + 4
 _PER_CONTACT = 4 + 2 * 4 + 5 * 8 + 4 + 4 + 2 * 4 + CONTACT.itemsize + ITERATE.itemsize
 _PADDING = 8 * 32  # of arrays that end within a word
 
@@ -35,13 +35,12 @@ class Grains(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """As in ``numba_engine.arrays``; found has the pairs that each lane has found in a search."""
+    """As in ``numba_engine.arrays``; in a search, listed has the ranks of the grains of a cell."""
 
     ends: Any
     images: Any
     calendar: Any
     listed: Any
-    found: Any
     starts: Any
     cells: Any
     sorted: Any
@@ -105,7 +104,7 @@ def array_at(address, shape, dtype):
 
 
 def words_needed(grains: int, lanes: int) -> int:
-    """The words of eight bytes of one replica, with the slots of its team."""
+    """The words of eight bytes of one replica."""
     per_grain = _PER_GRAIN + PAIRS_PER_GRAIN * _PER_PAIR + 3 * _PER_CONTACT
     return lanes * NUMBERS + (per_grain * grains + 4 * MOST_COLOURS + _PADDING) // 8
 
@@ -122,8 +121,7 @@ def memory_at(address, grains, lanes):
     images, address = array_at(address, (2, slots), np.float64)
     calendar, address = array_at(address, (3, slots), np.int32)
     listed, address = array_at(address, slots, np.uint32)
-    found, address = array_at(address, 2 * slots, np.uint32)
-    starts, address = array_at(address, max(9, 2 * count) + 1, np.uint32)
+    cell_starts, address = array_at(address, max(9, 2 * count) + 1, np.uint32)
     cells, address = array_at(address, count, np.uint32)
     in_cells, address = array_at(address, count, np.uint32)
     near_pair, address = array_at(address, contacts, np.uint32)
@@ -141,7 +139,7 @@ def memory_at(address, grains, lanes):
     matrices, address = array_at(address, (count, 3), np.float64)
     memory = Memory(
         Grains(motion, constants),
-        Pairs(ends, images, calendar, listed, found, starts, cells, in_cells),
+        Pairs(ends, images, calendar, listed, cell_starts, cells, in_cells),
         Network(near_pair, contact_ends, rows, loaded, impulses, colours, colour),
         Clusters(source, starts, solver_ends, solver_rows, iterate, impulses, matrices),
         sums,
