@@ -110,6 +110,7 @@ MISTAKES = {  # one for each kind of option, check and file
     f"{FLOW} --trajectory flow.gsd --force-strain 1": "at most the strain between",
     f"{FLOW} --movie flow.gif --seeds 2": "show one flow of one seed: leave out --seeds",
     "where --restitution 0.5": "--restitution and --packing-fraction are required, or --law",
+    "where --restitution 0.1:0.9:100000 --packing-fraction 0.7:0.8:1000": "pairs, not 100000000",
     "where --law text.nc": "--law must be a file name that ends in .csv",
     f"{FLOW} --resume": "--resume requires --output",
     "run --restitution 0.5": "Missing option '--packing-fraction'",

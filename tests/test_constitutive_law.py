@@ -122,6 +122,8 @@ def test_the_range_ends_where_it_says() -> None:
         with pytest.raises(jg.InputError, match="the range of the reference map"):
             LAW(alpha, nu)
         assert np.all(np.isnan(jax.jit(LAW)(alpha, nu)))
+        for derivative in (jax.grad, jax.jacfwd):
+            assert np.isnan(derivative(lambda *x: LAW(*x).pressure.value, (0, 1))(alpha, nu)).all()
     for rate in (0.0, -1.0, np.inf, "1"):
         with pytest.raises(jg.InputError, match="shear_rate must be a positive number"):
             LAW(0.5, 0.5, rate)

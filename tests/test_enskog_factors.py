@@ -208,6 +208,9 @@ def test_own_grains_must_be_given_and_the_unit_of_mass_changes_no_factor() -> No
     for other in (heavy, replace(sample, area=1.1 * sample.area)):
         with refused("grains must be given"):
             measured_over_enskog(FLOW, [other])
+    hollow = jg.own_grains(np.ones(GRAINS), np.where(np.arange(GRAINS) % 2, 0.03, 1))
+    with refused("masses proportional to the squares of their diameters"):
+        measured_over_enskog(FLOW, [sample], hollow)
     expected, _ = measured_over_enskog(FLOW, [sample])
     value, _ = measured_over_enskog(FLOW, [heavy], grains)
     for name, factor in expected.items():

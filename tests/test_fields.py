@@ -235,6 +235,15 @@ def test_averages_over_the_cell_are_the_virial_sums(seen) -> None:
     )
 
 
+def test_a_traced_width_that_does_not_fit_into_the_cell_makes_fields_nan(seen, points) -> None:
+    """As nobody can be told; and so for a traced snapshot."""
+    widest = (float(seen.state.side) / 2 - float(seen.state.grains.radii.max())) / 6
+    traced = jax.jit(lambda seen, width: fields_at(seen, points, width))
+    for width in (0.99 * widest, 1.01 * widest, -0.1):
+        fields = traced(seen, width)
+        assert all(np.isnan(x).all() == (width != 0.99 * widest) for x in jax.tree.leaves(fields))
+
+
 def test_fields_are_those_of_every_image(seen, points) -> None:
     """At r + lattice vector the velocity has γ̇L more a row; images of grains are nothing."""
     width, side, tilt = 0.3, seen.state.side, seen.state.tilt

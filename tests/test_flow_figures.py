@@ -13,6 +13,7 @@ from matplotlib.collections import EllipseCollection, PolyCollection
 from PIL import Image, ImageSequence
 from synthetic import snapshot_of
 
+import jaxgran as jg
 from jaxgran.plotting import flow, movie
 from jaxgran.plotting.flow import Scale, common_scale, draw_flow, flow_figure, network_of, title_of
 from jaxgran.plotting.movie import Frames, check_movie, write_movie
@@ -114,6 +115,15 @@ def test_picture_is_the_same_in_any_unit_of_time() -> None:
     )
     jax.tree.map(np.testing.assert_array_equal, network_of(one), network_of(other))
     assert title_of(one) == title_of(other)
+
+
+def test_snapshots_whole_units_of_strain_and_a_step_apart_are_not_those_of_every_step() -> None:
+    flow = jg.ShearFlow(16, 0.5, 0.5, 1e-2)
+    state = jg.heated(flow, jax.random.key(0))
+    _, each = jg.snapshot_series(flow, state, strain=0.05, count=5)
+    assert "5 time steps, a strain of 0.05" in title_of(each)
+    _, apart = jg.snapshot_series(flow, state, strain=2.02, count=2)
+    assert "2 snapshots" in title_of(apart)
 
 
 @pytest.mark.parametrize("contacts", [(), ((0, 1, 0.0),)], ids=["no contacts", "no forces"])

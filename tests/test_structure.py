@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 from flows import GRAINS
-from synthetic import SNAPSHOTS, snapshot_of
+from synthetic import SNAPSHOTS, refused, snapshot_of
 
 from jaxgran.analysis.contacts import cluster_share, clusters, loaded_contacts
 from jaxgran.analysis.series import series
@@ -56,6 +56,9 @@ def test_times_are_apart_and_errors_come_from_their_blocks() -> None:
     np.testing.assert_array_equal(clusters(both).sizes[1], [2, 2, 1, 1, 1, 1, 1])
     assert np.isfinite(cluster_share(both).force.error)
     one = jax.tree.map(lambda x: x[0], both)
+    batch = jax.tree.map(lambda x: np.stack([x, x]), both)
+    with refused("those of one flow"):
+        clusters(batch)
     share = cluster_share(one)
     assert share.force.value == 0.75 and np.isnan(share.force.error)
 

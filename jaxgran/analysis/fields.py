@@ -20,7 +20,7 @@ the right); Goldhirsch and Goldenberg, Eur. Phys. J. E 9, 245 (2002), for the li
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +40,6 @@ from jaxgran.model.checks import (
     require_number,
     require_whole,
 )
-from jaxgran.model.state import State
 from jaxgran.model.values import Value
 
 _REACH = 6.0  # widths, at which the Gaussian has fallen to e⁻¹⁸ = 1.5e-8 of its peak
@@ -107,7 +106,8 @@ def fields_at(snapshot: Snapshot, points: Float[Array, "points 2"], width: float
 
     Raises:
       InputError: the width is not positive, or six widths are more than half the side minus the
-        largest radius, so that two images of a grain would be within reach of a point.
+        largest radius, so that two images of a grain would be within reach of a point. While JAX
+        traces it or the snapshot, all fields are NaN.
     """
     if not isinstance(snapshot, Snapshot) or jnp.ndim(snapshot.state.positions) != 2:
         raise InputError(
@@ -117,9 +117,14 @@ def fields_at(snapshot: Snapshot, points: Float[Array, "points 2"], width: float
     require(
         "points", points, lambda x: x.ndim == 2 and x.shape[1] == 2 and np.isfinite(x), accepted
     )
-    widest = _widest(snapshot.state)
-    accepted = f"positive and at most {widest:g} in this cell"
-    require_number("width", width, lambda x: (x > 0) & at_most(x, widest), accepted)
+    state = snapshot.state
+    side, radii = (concrete_or_none(x) for x in (state.side, state.grains.radii))
+    if side is None or radii is None:
+        require_number("width", width, lambda x: x > 0, "a positive number")
+    else:
+        widest = _widest(side, radii)
+        accepted = f"positive and at most {widest:g} in this cell"
+        require_number("width", width, lambda x: (x > 0) & at_most(x, widest), accepted)
     return _fields_at(snapshot, points, width)
 
 
@@ -135,10 +140,9 @@ def grid(side: float | Array, count: int) -> Float[Array, "points 2"]:
     return jnp.stack([jnp.tile(ticks, count), jnp.repeat(ticks, count)], axis=-1)
 
 
-def _widest(state: State) -> float:
-    """The largest width that fits into the cell; infinite while JAX traces it."""
-    side, radii = (concrete_or_none(x) for x in (state.side, state.grains.radii))
-    return np.inf if side is None or radii is None else float((side / 2 - radii.max()) / _REACH)
+def _widest(side: Any, radii: Any) -> Any:
+    """The largest width that fits into the cell."""
+    return (side / 2 - radii.max()) / _REACH
 
 
 @jax.jit
@@ -163,6 +167,7 @@ def _fields_at(snapshot: Snapshot, points: Array, width: Array) -> Fields:
     grains = _in_blocks((before.positions, cx), jnp.stack(carried, axis=1), masses > 0, side)
     pairs = _in_blocks((middles, contacts.normals, lengths), transferred, loaded, side)
     reach = _NEGLIGIBLE * width
+    fits = (width > 0) & at_most(width, _widest(side, before.grains.radii))
 
     def of_grains(points: Array, positions: Array, cx: Array) -> Array:
         d = displacement(points[:, None], positions[None], side, tilt)
@@ -211,7 +216,8 @@ def _fields_at(snapshot: Snapshot, points: Array, width: Array) -> Fields:
     blocks = _by_height(points[:, 1] / side % 1)
     place = jnp.argsort(blocks.ravel())[: len(points)]
     fields = lax.map(at, points[blocks])
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[place], fields)
+    known = jnp.where(fits, 1.0, jnp.nan)
+    return jax.tree.map(lambda x: known * x.reshape(-1, *x.shape[2:])[place], fields)
 
 
 class _Block(NamedTuple):

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from jaxgran.dynamics.snapshot import Snapshot
+from jaxgran.model.checks import InputError
 from jaxgran.statistics import standard_errors
 
 Sums = Mapping[str, Any]  # NumPy arrays or scalars by name
@@ -26,6 +27,10 @@ def series(snapshots: Snapshot) -> Any:
     one.
     """
     frames = jax.tree.map(np.asarray, snapshots)
+    if frames.state.side.ndim > 1:
+        raise InputError(
+            "the snapshots must be those of one flow: of a batch, take seen[k] for the replica k."
+        )
     return frames if frames.state.side.ndim else jax.tree.map(lambda x: x[None], frames)
 
 

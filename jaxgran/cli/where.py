@@ -10,6 +10,7 @@ from jaxgran.cli.output import JSON, Entry, in_brackets, print_json, print_table
 from jaxgran.cli.terminal import say_written
 from jaxgran.maps.options import Option
 from jaxgran.model.checks import InputError
+from jaxgran.model.choices import MAX_REPLICAS
 from jaxgran.model.display import with_error
 from jaxgran.reference.evaluation import Estimate
 from jaxgran.reference.table import MEASURED, THEORIES, shipped_table
@@ -58,6 +59,12 @@ def run_where_command(
     no_pair = restitution is None or packing_fraction is None
     if no_pair and (law is None or json):
         raise InputError("`restitution` and `packing_fraction` are required, or `law` alone.")
+    pairs = len(restitution or ()) * len(packing_fraction or ())
+    if pairs > MAX_REPLICAS:
+        raise InputError(
+            f"`restitution` and `packing_fraction` must have at most {MAX_REPLICAS} pairs, not "
+            f"{pairs}."
+        )
     if law is not None:
         from jaxgran.io.paths import require_place
         from jaxgran.reference.law import constitutive_law

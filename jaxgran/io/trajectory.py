@@ -11,7 +11,8 @@ configuration/step             (1,)            –       time steps since the fi
 configuration/box              (6,)            σ, –    ℓ, ℓ, 0, tilt, 0, 0; two dimensions
 particles/position             (grains, 3)     σ       centres, in the box around the origin; z = 0
 particles/velocity             (grains, 3)     σ/t     peculiar velocities c, before the contacts
-                                                       act; in the laboratory c + γ̇ y x̂
+                                                       act; in the laboratory c + γ̇ y x̂ with y of
+                                                       the exact position, from the lower edge
 particles/diameter, /mass      (grains,)       σ, m    diameters and masses
 bonds/group                    (bonds, 2)      –       pairs i < j of grains in loaded contact in
                                                        the steps of ``force_strain``

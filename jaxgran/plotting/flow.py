@@ -183,7 +183,11 @@ def title_of(seen: Snapshot, strain: float | None = None) -> str:
     if times == 1:
         return f"{', '.join(parts)}\nforces of one time step"
     between = float(np.mean(np.diff(state.tilt) % 1))
-    every_step = abs(between / timestep - 1) < 1e-3
+    moved = np.diff(state.positions[..., 1], axis=0)
+    moved -= state.side[0] * np.rint(moved / state.side[0])
+    fastest = np.abs(state.velocities[..., 1]).max() * frames.timestep[0]
+    # the tilt alone does not tell whole units of strain
+    every_step = abs(between / timestep - 1) < 1e-3 and np.abs(moved).max() <= 1.01 * fastest
     window = f"{times} time steps, a strain of {times * between:.3g}"
     mean = f"mean forces over {window if every_step else f'{times} snapshots'}"
     return f"{', '.join(parts)}\n{mean}"

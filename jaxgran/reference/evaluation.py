@@ -42,7 +42,8 @@ def over_range(
       packing_fraction: ν, a number or an array; the two broadcast.
 
     Returns:
-      α, ν and the pytree. NaN where JAX traces a value that is outside the range.
+      α, ν and the pytree. NaN where JAX traces a value that is outside the range, and so are the
+      derivatives there.
 
     Raises:
       InputError: a value is outside the range, shapes do not broadcast, or JAX traces a value in
@@ -68,13 +69,16 @@ def over_range(
 
     (low, high), (loosest, densest) = ranges
     inside = (low <= alpha) & (alpha <= high) & (loosest <= nu) & (nu <= densest)
+    # 0 × and the factor 1 or NaN: derivatives outside are NaN as well, in both modes
     where = coordinates(
-        xp.where(inside, alpha, (low + high) / 2), xp.where(inside, nu, (loosest + densest) / 2), xp
+        xp.where(inside, alpha, (low + high) / 2 + 0 * alpha),
+        xp.where(inside, nu, (loosest + densest) / 2 + 0 * nu),
+        xp,
     )
     # one by one: ranks are promoted nowhere
     estimates = jax.vmap(lambda point: evaluate(point, xp))(where.reshape(-1, 2))
-    shaped = jax.tree.map(lambda x: xp.where(inside, x.reshape(alpha.shape), np.nan), estimates)
-    return alpha, nu, shaped
+    known = xp.where(inside, 1.0, np.nan)
+    return alpha, nu, jax.tree.map(lambda x: known * x.reshape(alpha.shape), estimates)
 
 
 def module_of(*values: Any) -> Any:

@@ -87,7 +87,9 @@ def measured_over_enskog(
 
     Raises:
       InputError: (a ValueError) ``grains`` is None, and size or mass of the discs is not that of
-        uniform diameters.
+        uniform diameters; or the masses of ``grains`` are not proportional to the squares of their
+        diameters: heavy and light grains then have temperatures of their own, which Enskog's rates
+        at one temperature would count among the other factors.
 
     Returns:
       Values and errors by name: ``pressure_chaos`` and so on for each of ``RATES`` and
@@ -99,6 +101,8 @@ def measured_over_enskog(
     """
     if grains is None:
         _require_uniform(flow, seeds[0])
+    else:
+        _require_one_material(grains)
     classes = None if grains is None else size_classes(grains)
     sums = jax.tree.map(
         lambda *x: np.stack([np.asarray(part) for part in x]), *(seed.tally for seed in seeds)
@@ -118,6 +122,16 @@ def _require_uniform(flow: ShearFlow, sample: Sample) -> None:
         raise InputError(
             "grains must be given, as those of the samples have no uniform diameters d or not the "
             "masses d²."
+        )
+
+
+def _require_one_material(grains: Grains) -> None:
+    """Raise an InputError unless masses are proportional to the squares of the diameters."""
+    density = np.asarray(grains.masses) / np.square(grains.radii)
+    if not np.allclose(density, density[0], rtol=1e-3):
+        raise InputError(
+            "grains must have masses proportional to the squares of their diameters: heavy and "
+            "light grains have temperatures of their own, and the factors are of one for all."
         )
 
 
