@@ -73,12 +73,12 @@ def cell_of(x, y, side, tilt, rows, columns):
 
 
 @njit
-def stretch_of(part, cell, rows, columns, starts):
+def stretch_of(part, row, column, rows, columns, starts):
     """Half of the cells around a cell in four stretches of sorted grains: itself and its right
     neighbour, the three above it, and those of either across the boundary; returns the first grain,
     the end, and the column and the row of the image.
     """
-    row, column = cell // columns, cell % columns
+    cell = row * columns + column
     above, image_above = (row + 1) * columns, 0  # first cell of the next row, and its image
     if row + 1 == rows:
         above, image_above = 0, 1
@@ -120,8 +120,11 @@ def _pairs_of_cells(pairs, side, tilt, rows, columns, skin, capacity):
     ends, images = pairs.ends, pairs.images
     count = 0
     for cell in range(rows * columns):
+        row, column = cell // columns, cell % columns
         for part in range(4):
-            begin, end, image_column, image_row = stretch_of(part, cell, rows, columns, starts)
+            begin, end, image_column, image_row = stretch_of(
+                part, row, column, rows, columns, starts
+            )
             image_x, image_y = (image_column + image_row * tilt) * side, image_row * side
             for m in range(starts[cell], starts[cell + 1]):
                 i, x, y = sorted_grains[m], places[0, m] - image_x, places[1, m] - image_y

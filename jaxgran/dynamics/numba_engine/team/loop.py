@@ -278,17 +278,20 @@ def _find_near_pairs(team, grains, pairs, side, tilt, reach, skin, capacity):
         _sort_into_cells(team, motion, pairs, side, tilt, rows, columns)
     for first in in_turns(team, count):
         m, here = own_index(team, first, count)
-        i, cell = np.uint32(m), 0
+        i, own_row, own_column = np.uint32(m), 0, 0
         if here and rows > 0:
             i = order[m]
             cell = np.int64(pairs.cells[i])
+            own_row, own_column = cell // columns, cell % columns
         x, y, radius_and_skin = 0.0, 0.0, 0.0
         if here:
             x, y, radius_and_skin = motion[i].x, motion[i].y, constants[i].radius + skin
         for part in range(4 if rows > 0 else 1):
             begin, end, column, row = 0, count, 0, 0
             if rows > 0:
-                begin, end, column, row = stretch_of(part, cell, rows, columns, pairs.starts)
+                begin, end, column, row = stretch_of(
+                    part, own_row, own_column, rows, columns, pairs.starts
+                )
             n, end = m + np.uint64(1) if part == 0 else np.uint64(begin), np.uint64(end)
             image_x, image_row = (column + row * tilt) * side, float(row)
             while ballot(team, here and n < end) > 0:
