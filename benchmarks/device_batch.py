@@ -1,12 +1,11 @@
 """Batches of replicas on the device that JAX finds, beside one core of the numba rival.
 
-Replicas are advanced from the same states by what jaxgran takes for this device and,
-a few of them, by the rival. Replica-steps per second are printed and written as JSON, with the
-pressure against that of the rival and the peak of the device's memory where it tells. Where the
-replicas advance in lockstep their number decides the speed, so it is raised, and one large flow is
-advanced as well. States are prepared on the processor. With ``--engine numba`` a device takes the
-numba engine, whose calls must repeat to the bit, also at 64 and 1024 grains; the last of its
-batches needs some 25 GB.
+Replicas are advanced from the same states by what jaxgran takes for this device and, a few of them,
+by the rival. Replica-steps per second are printed and written as JSON, with the pressure against
+that of the rival and the peak of the device's memory where it tells. Where the replicas advance in
+lockstep their number decides the speed, so it is raised, and one large flow is advanced as well.
+States are prepared on the processor. With ``--engine numba`` a device takes the numba engine, whose
+calls must repeat to the bit, also at 64 and 1024 grains; the last of its batches needs some 25 GB.
 
     python -m benchmarks device_batch           # a processor: 2 minutes
     python -m benchmarks device_batch --quick   # under a minute

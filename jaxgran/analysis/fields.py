@@ -20,7 +20,7 @@ the right); Goldhirsch and Goldenberg, Eur. Phys. J. E 9, 245 (2002), for the li
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +40,7 @@ from jaxgran.model.checks import (
     require_number,
     require_whole,
 )
+from jaxgran.model.state import State
 from jaxgran.model.values import Value
 
 _REACH = 6.0  # widths, at which the Gaussian has fallen to e⁻¹⁸ = 1.5e-8 of its peak
@@ -106,8 +107,8 @@ def fields_at(snapshot: Snapshot, points: Float[Array, "points 2"], width: float
 
     Raises:
       InputError: the width is not positive, or six widths are more than half the side minus the
-        largest radius, so that two images of a grain would be within reach of a point. While JAX
-        traces it or the snapshot, all fields are NaN.
+        largest radius, so that two images of a grain would be within reach of a point. Where JAX
+        traces the width or the snapshot, all fields are NaN instead.
     """
     if not isinstance(snapshot, Snapshot) or jnp.ndim(snapshot.state.positions) != 2:
         raise InputError(
@@ -117,14 +118,10 @@ def fields_at(snapshot: Snapshot, points: Float[Array, "points 2"], width: float
     require(
         "points", points, lambda x: x.ndim == 2 and x.shape[1] == 2 and np.isfinite(x), accepted
     )
-    state = snapshot.state
-    side, radii = (concrete_or_none(x) for x in (state.side, state.grains.radii))
-    if side is None or radii is None:
-        require_number("width", width, lambda x: x > 0, "a positive number")
-    else:
-        widest = _widest(side, radii)
-        accepted = f"positive and at most {widest:g} in this cell"
-        require_number("width", width, lambda x: (x > 0) & at_most(x, widest), accepted)
+    widest = concrete_or_none(_widest(snapshot.state))
+    accepted = "positive" if widest is None else f"positive and at most {widest:g} in this cell"
+    limit = np.inf if widest is None else widest
+    require_number("width", width, lambda x: (x > 0) & at_most(x, limit), accepted)
     return _fields_at(snapshot, points, width)
 
 
@@ -140,9 +137,9 @@ def grid(side: float | Array, count: int) -> Float[Array, "points 2"]:
     return jnp.stack([jnp.tile(ticks, count), jnp.repeat(ticks, count)], axis=-1)
 
 
-def _widest(side: Any, radii: Any) -> Any:
+def _widest(state: State) -> Array:
     """The largest width that fits into the cell."""
-    return (side / 2 - radii.max()) / _REACH
+    return (state.side / 2 - state.grains.radii.max()) / _REACH
 
 
 @jax.jit
@@ -167,7 +164,6 @@ def _fields_at(snapshot: Snapshot, points: Array, width: Array) -> Fields:
     grains = _in_blocks((before.positions, cx), jnp.stack(carried, axis=1), masses > 0, side)
     pairs = _in_blocks((middles, contacts.normals, lengths), transferred, loaded, side)
     reach = _NEGLIGIBLE * width
-    fits = (width > 0) & at_most(width, _widest(side, before.grains.radii))
 
     def of_grains(points: Array, positions: Array, cx: Array) -> Array:
         d = displacement(points[:, None], positions[None], side, tilt)
@@ -216,7 +212,7 @@ def _fields_at(snapshot: Snapshot, points: Array, width: Array) -> Fields:
     blocks = _by_height(points[:, 1] / side % 1)
     place = jnp.argsort(blocks.ravel())[: len(points)]
     fields = lax.map(at, points[blocks])
-    known = jnp.where(fits, 1.0, jnp.nan)
+    known = jnp.where((width > 0) & at_most(width, _widest(before)), 1.0, jnp.nan)
     return jax.tree.map(lambda x: known * x.reshape(-1, *x.shape[2:])[place], fields)
 
 

@@ -62,9 +62,10 @@ def merge_maps(
       [0.8, 0.9]
     """
     path = (str, os.PathLike)
-    is_list = isinstance(maps, (list, tuple)) and len(maps) > 0
-    if not is_list or not all(isinstance(source, (*path, xr.DataTree)) for source in maps):
-        is_list = isinstance(maps, (list, tuple))
+    is_list = isinstance(maps, (list, tuple))
+    if not (is_list and maps) or not all(
+        isinstance(source, (*path, xr.DataTree)) for source in maps
+    ):
         kinds = [type(source).__name__ for source in maps] if is_list else type(maps).__name__
         raise InputError(
             f"maps must be a list of at least one map, a DataTree, or file, not {kinds}."

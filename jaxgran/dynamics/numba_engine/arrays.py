@@ -8,22 +8,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from jaxgran.dynamics.numba_engine.layout import LANES, LEAST_SHIFT, record
+from jaxgran.dynamics.numba_engine.layout import LANES, LEAST_SHIFT, doubles
 from jaxgran.dynamics.tally import NUMBERS
 
 _PAIRS_PER_GRAIN = 16  # capacity
 
 
-MOTION = record("x", "y", "vx", "vy")
-CONSTANTS = record("radius", "inverse_mass")
+MOTION = doubles("x", "y", "vx", "vy")
+CONSTANTS = doubles("radius", "inverse_mass")
 # A contact in the solver: μ n, μ u⁻, 1/μ, 1/(μ m_i), 1/(μ m_j) and J, with the reduced mass μ;
 # padded to a cache line
-CONTACT = record(
+CONTACT = doubles(
     "mu_nx", "mu_ny", "mu_u", "inverse_mu", "inverse_mu_mi", "inverse_mu_mj", "impulse", "padding"
 )
 # A contact in the method of Barzilai and Borwein: W J, the last changes of J and of W J, J of the
 # best iterate, and the diagonal D
-ITERATE = record("response", "step", "response_change", "best", "bound")
+ITERATE = doubles("response", "step", "response_change", "best", "bound")
 
 
 class Grains(NamedTuple):

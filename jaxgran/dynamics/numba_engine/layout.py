@@ -30,12 +30,12 @@ class Inputs(NamedTuple):
     max_steps: Any
 
 
-def record(*fields: str) -> np.dtype:
-    """Doubles side by side; aligned, as a device would load others byte by byte."""
+def doubles(*fields: str) -> np.dtype:
+    """Named doubles side by side; aligned, as a device would load others byte by byte."""
     return np.dtype([(name, np.float64) for name in fields], align=True)
 
 
-INPUTS = record(*Inputs._fields)
+INPUTS = doubles(*Inputs._fields)
 INPUT_NUMBERS = len(Inputs._fields)
 
 # Columns of the results of a block, behind its sums: the status and the tilt; whether the call has

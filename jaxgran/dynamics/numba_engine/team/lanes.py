@@ -150,13 +150,21 @@ def place_in_list(team, wanted, count):
 
 
 @njit
-def least(team, number):
-    """The least whole number of the lanes."""
+def _combined(team, number, combine):
+    """The numbers of all lanes, combined in pairs, then in pairs of pairs: with the same bits in
+    every lane, if ``combine`` does not mind the order of its two.
+    """
     step = team.lanes >> np.uint64(1)
     while step > 0:
-        number = min(number, of_lane(team, number, team.lane ^ step))
+        number = combine(number, of_lane(team, number, team.lane ^ step))
         step >>= np.uint64(1)
     return number
+
+
+@njit
+def least(team, number):
+    """The least whole number of the lanes."""
+    return _combined(team, number, min)
 
 
 @njit
@@ -173,19 +181,10 @@ def before_and_total(team, number):
 @njit
 def sum_of(team, number):
     """The sum of a real number over the lanes."""
-    step = team.lanes >> np.uint64(1)
-    while step > 0:
-        number = plain_sum(number, of_lane(team, number, team.lane ^ step))
-        step >>= np.uint64(1)
-    return number
+    return _combined(team, number, plain_sum)
 
 
 @njit
 def largest(team, number):
     """The largest real number of the lanes; infinite where one is infinite or NaN."""
-    number = number if number < np.inf else np.inf
-    step = team.lanes >> np.uint64(1)
-    while step > 0:
-        number = max(number, of_lane(team, number, team.lane ^ step))
-        step >>= np.uint64(1)
-    return number
+    return _combined(team, number if number < np.inf else np.inf, max)

@@ -292,11 +292,12 @@ def _find_near_pairs(team, grains, pairs, side, tilt, reach, skin, capacity):
                 begin, end, column, row = stretch_of(
                     part, own_row, own_column, rows, columns, pairs.starts
                 )
-            n, end = m + np.uint64(1) if part == 0 else np.uint64(begin), np.uint64(end)
+            n = m + np.uint64(1) if part == 0 else np.uint64(begin)
+            end = np.uint64(end) if here else np.uint64(0)
             image_x, image_row = (column + row * tilt) * side, float(row)
-            while ballot(team, here and n < end) > 0:
+            while ballot(team, n < end) > 0:
                 j, is_near = np.uint32(n), False
-                if here and n < end:
+                if n < end:
                     j = order[n] if rows > 0 else j
                     dx, dy = x - motion[j].x, y - motion[j].y
                     if rows == 0:
